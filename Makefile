@@ -1,0 +1,68 @@
+# `make demo` and `make test` need only python3 (3.11 or newer) and make; everything else they install into .venv.
+
+PYTHON ?= python3
+VENV   := .venv
+BIN    := $(VENV)/bin
+STAMP  := $(VENV)/.installed
+RUNS   ?= runs
+
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+export PYGAME_HIDE_SUPPORT_PROMPT := 1
+
+.DEFAULT_GOAL := help
+.PHONY: help install demo test test-slow bench format clean
+
+help:
+	@echo "make demo       train PPO on CartPole-v1 with 8 seeds, evaluate, plot and film it"
+	@echo "make test       linter, formatter check, type checker, tests"
+	@echo "make test-slow  the learning tests that take long"
+	@echo "make bench      measure against other libraries, write docs/performance.md"
+	@echo "make format     format the code and mend what the linter can"
+	@echo "make clean      remove .venv, caches and build files (runs/ stays)"
+
+install: $(STAMP)
+
+# On Debian python3 comes without ensurepip; its package python3-venv brings it.
+$(STAMP): pyproject.toml constraints.txt
+	@command -v $(PYTHON) >/dev/null || { echo "error: $(PYTHON) was not found: install Python 3.11 or newer, or say which: make PYTHON=/path/to/python3" >&2; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "error: Thorndike needs Python 3.11 or newer, but $(PYTHON) is $$($(PYTHON) --version 2>&1): say which to use: make PYTHON=/path/to/python3.11" >&2; exit 1; }
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { \
+	  run=; [ "$$(id -u)" = 0 ] || run="sudo -n"; \
+	  echo "installing python3-venv, which $(PYTHON) lacks"; \
+	  { $$run apt-get update -qq && $$run env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq python3-venv; } >/dev/null 2>&1; \
+	  $(PYTHON) -c 'import ensurepip, venv' 2>/dev/null; \
+	} || { echo "error: $(PYTHON) cannot make virtual environments; type: sudo apt-get install python3-venv" >&2; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+	PIP_CONSTRAINT=$(abspath constraints.txt) PIP_BUILD_CONSTRAINT=$(abspath constraints.txt) \
+	  $(BIN)/python -m pip install --quiet --editable '.[all,dev]'
+	@touch $@
+
+demo: export SDL_VIDEODRIVER := dummy
+demo: $(STAMP)
+	@$(BIN)/thorndike train ppo CartPole-v1 --seeds 8 --name demo --output $(RUNS)
+	@echo
+	@$(BIN)/thorndike eval latest --output $(RUNS)
+	@echo
+	@$(BIN)/thorndike plot latest --output $(RUNS)
+	@$(BIN)/thorndike watch latest --output $(RUNS) --video $(RUNS)/demo.mp4
+
+test: $(STAMP)
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+	@$(BIN)/mypy
+	@$(BIN)/pytest -q -m "not slow"
+
+test-slow: $(STAMP)
+	@$(BIN)/pytest -q -m slow
+
+bench: $(STAMP)
+	@$(BIN)/python benchmarks/run.py
+
+format: $(STAMP)
+	@$(BIN)/ruff check --fix .
+	@$(BIN)/ruff format .
+
+clean:
+	rm -rf $(VENV) $(VENV)-* build dist .pytest_cache .mypy_cache .ruff_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+	find . -name '*.egg-info' -type d -prune -exec rm -rf {} +

@@ -1,0 +1,43 @@
+"""Thorndike: learning from reward, from a two-armed bandit to a language model, in one small code base on JAX.
+
+>>> import thorndike as td
+>>> policy = td.load(td.train("ppo", "CartPole-v1", seeds=8).run)  # doctest: +SKIP
+>>> action, memory = policy.predict(obs)  # doctest: +SKIP
+"""
+
+import importlib
+
+_PUBLIC = {
+    "train": "thorndike.api",
+    "resume": "thorndike.api",
+    "load": "thorndike.api",
+    "runs": "thorndike.api",
+    "Result": "thorndike.api",
+    "LoadedPolicy": "thorndike.api",
+    "PPO": "thorndike.api",
+    "DQN": "thorndike.api",
+    "QLearning": "thorndike.api",
+    "make": "thorndike.api",
+    "evaluate": "thorndike.api",
+    "UserError": "thorndike.errors",
+    "Network": "thorndike.networks.network",
+    "functional": "thorndike.functional",
+    "networks": "thorndike.networks",
+    "planning": "thorndike.algorithms.planning",
+    "wrappers": "thorndike.environments.wrappers",
+}
+"""Public name -> the module it lives in, imported when it is first used: ``import thorndike`` costs milliseconds."""
+
+__all__ = sorted(_PUBLIC)  # noqa: PLE0605
+__version__ = "0.1.0"
+
+
+def __getattr__(name: str) -> object:
+    if name not in _PUBLIC:
+        raise AttributeError(f"module 'thorndike' has no attribute {name!r}")
+    module = importlib.import_module(_PUBLIC[name])
+    return module if module.__name__.rpartition(".")[2] == name else getattr(module, name)
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]

@@ -1,0 +1,96 @@
+"""Algorithms as objects, for those who think in them: ``PPO("CartPole-v1", learning_rate=1e-3).learn(100_000).predict(obs)``."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import PyTree
+
+from thorndike.api.loading import LoadedPolicy, load
+from thorndike.api.training import Result, resume, train
+from thorndike.errors import UserError
+from thorndike.settings import read_config_fields
+from thorndike.suggestions import did_you_mean
+from thorndike.training.evaluation import Evaluation
+
+
+class Learner:
+    """An algorithm on an environment. Every ``learn`` makes or continues a run directory, ``learner.result.run``."""
+
+    algorithm: str
+
+    def __init__(
+        self,
+        environment: object,
+        *,
+        num_envs: int | None = None,
+        seeds: int = 1,
+        seed: int = 0,
+        preset: str | None = None,
+        engine: str = "auto",
+        device: str = "auto",
+        output: str | Path = "runs",
+        wrappers: Sequence[object] | None = None,
+        network: Callable | None = None,
+        env_kwargs: dict[str, object] | None = None,
+        **settings: object,
+    ) -> None:
+        """``settings`` are the fields of the algorithm's ``Config``. Raises ``UserError`` at once for one that it does not have."""
+        known = read_config_fields(self.algorithm)
+        for name in settings:
+            if name not in known:
+                raise UserError(f"{self.algorithm} has no setting '{name}'{did_you_mean(name, known)}")
+        self._environment = environment
+        self._wrappers, self._network = wrappers, network
+        self._request = {
+            "num_envs": num_envs, "seeds": seeds, "seed": seed, "preset": preset, "engine": engine, "device": device, "output": output,
+            "env_kwargs": env_kwargs, "settings": settings,
+        }  # fmt: skip
+        self.result: Result | None = None
+        self._policy: LoadedPolicy | None = None
+
+    def learn(self, steps: int | None = None, progress: bool = False) -> "Learner":
+        """Train for ``steps`` environment steps of each seed; a second call trains that much further."""
+        objects = {"wrappers": self._wrappers, "network": self._network, "progress": progress}
+        if self.result is None:
+            self.result = train(self.algorithm, self._environment, steps=steps, **self._request, **objects)
+        else:
+            further = None if steps is None else self.result.steps + steps
+            self.result = resume(self.result.run, steps=further, environment=self._environment, **objects)
+        self._policy = None
+        return self
+
+    @property
+    def policy(self) -> LoadedPolicy:
+        """The trained policy. Raises ``UserError`` before ``learn``."""
+        if self.result is None:
+            raise UserError(f"this {type(self).__name__} has not learnt yet: call .learn(steps) first")
+        if self._policy is None:
+            self._policy = load(self.result.run, environment=self._environment, network=self._network)
+        return self._policy
+
+    def predict(self, obs: PyTree, memory: PyTree = None, deterministic: bool = True) -> tuple[np.ndarray, PyTree]:
+        """Action for one observation or a batch, and the memory to pass with the next."""
+        return self.policy.predict(obs, memory, deterministic)
+
+    def evaluate(self, episodes: int = 100, seed: int = 0) -> Evaluation:
+        """Run every seed on fresh reference environments."""
+        return self.policy.evaluate(episodes, seed)
+
+
+class PPO(Learner):
+    """Proximal policy optimisation."""
+
+    algorithm = "ppo"
+
+
+class DQN(Learner):
+    """Deep Q-network."""
+
+    algorithm = "dqn"
+
+
+class QLearning(Learner):
+    """Tabular Q-learning and its relatives."""
+
+    algorithm = "q_learning"

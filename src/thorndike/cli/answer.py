@@ -1,0 +1,72 @@
+"""What a verb answers, and how it reaches the terminal: words for people, one JSON object for programs."""
+
+import contextlib
+import json
+import math
+import os
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple, Union
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+
+class Answer(NamedTuple):
+    """One result in both forms."""
+
+    data: Mapping[str, object]
+    """What ``--json`` prints."""
+    text: Union[str, "RenderableType"]
+    """What people read; anything rich can draw."""
+    exit_status: int = 0
+
+
+def show(answer: Answer, as_json: bool) -> None:
+    """Print an answer on stdout."""
+    if as_json:
+        print(as_json_text(answer.data))
+    elif isinstance(answer.text, str):
+        print(answer.text)
+    else:
+        from rich.console import Console
+
+        Console(soft_wrap=not sys.stdout.isatty(), highlight=False).print(answer.text)
+
+
+def as_json_text(data: Mapping[str, object]) -> str:
+    """One line of standard JSON: paths as text, and null for what is no number (JSON has no NaN)."""
+    return json.dumps(_plain(data), allow_nan=False)
+
+
+def _plain(value: object) -> object:
+    match value:
+        case Mapping():
+            return {str(key): _plain(part) for key, part in value.items()}
+        case str() | bool() | int() | None:
+            return value
+        case float():
+            return float(value) if math.isfinite(value) else None
+        case Path():
+            return str(value)
+        case Sequence():
+            return [_plain(part) for part in value]
+    # Arrays and scalars of NumPy and JAX, which are not imported here.
+    to_list = getattr(value, "tolist", None)
+    return _plain(to_list()) if callable(to_list) else str(value)
+
+
+@contextlib.contextmanager
+def stdout_for_the_answer_only() -> Iterator[None]:
+    """Meanwhile whatever is written to stdout, by C++ and subprocesses too, goes to stderr: with ``--json`` one object stands alone."""
+    sys.stdout.flush()
+    kept = os.dup(1)
+    os.dup2(2, 1)
+    try:
+        with contextlib.redirect_stdout(sys.stderr):
+            yield
+    finally:
+        sys.stderr.flush()
+        os.dup2(kept, 1)
+        os.close(kept)

@@ -1,0 +1,48 @@
+"""``thorndike eval RUN``: the trained policy on fresh environments of the reference engine."""
+
+from argparse import SUPPRESS
+from collections.abc import Sequence
+
+from thorndike.cli.answer import Answer
+from thorndike.cli.find_run import add_run_arguments, find_run
+from thorndike.cli.parser import Parser, not_negative_whole, positive_whole
+
+EXAMPLES = """\
+  thorndike eval latest
+  thorndike eval CartPole-v1/ppo --episodes 1000 --json"""
+
+
+def run(words: Sequence[str]) -> Answer:
+    """Evaluate every seed of a run, and say how well it does."""
+    parser = Parser("eval", "Score every seed of a trained run on fresh Gymnasium environments.", EXAMPLES)
+    add_run_arguments(parser)
+    parser.add_argument("--eval-episodes", dest="episodes", type=positive_whole, default=SUPPRESS, help=SUPPRESS)
+    parser.add_argument("--episodes", type=positive_whole, default=100, help="episodes of each seed (default: 100)")
+    parser.add_argument("--seed", type=not_negative_whole, default=0, help="the number the episodes follow from (default: 0)")
+    parser.add_argument("--num-envs", type=positive_whole, default=20, help="environments of each seed, stepped together")
+    parser.add_argument("--stochastic", action="store_true", help="draw actions from the policy instead of taking the best one")
+    options = parser.parse(words)
+    directory = find_run(options.run, options.output)
+    from thorndike import api
+
+    found = api.load(directory).evaluate(
+        episodes=options.episodes, seed=options.seed, num_envs=options.num_envs, deterministic=not options.stochastic
+    )
+    data = {
+        "run": found.run,
+        "environment": found.environment,
+        "episodes": found.episodes,
+        "mean": found.mean,
+        "iqm": found.iqm,
+        "min": found.min,
+        "ci95": found.ci95,
+        "per_seed": found.per_seed,
+    }
+    low, high = found.ci95
+    whose = "the only seed" if len(found.per_seed) == 1 else f"each of {len(found.per_seed)} seeds"
+    text = (
+        f"{found.environment}, {found.episodes:,} episodes of {whose}\n"
+        f"mean {found.mean:.4g} (95 % interval {low:.4g} to {high:.4g}), interquartile mean {found.iqm:.4g}, worst seed {found.min:.4g}\n"
+        f"per seed: {', '.join(f'{value:.4g}' for value in found.per_seed)}"
+    )
+    return Answer(data, text)

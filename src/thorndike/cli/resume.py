@@ -1,0 +1,26 @@
+"""``thorndike resume RUN``: go on where a run stopped."""
+
+from argparse import SUPPRESS
+from collections.abc import Sequence
+
+from thorndike.cli.answer import Answer
+from thorndike.cli.find_run import add_run_arguments, find_run
+from thorndike.cli.parser import Parser, positive_whole
+from thorndike.cli.train import trained
+
+EXAMPLES = """\
+  thorndike resume latest
+  thorndike resume runs/CartPole-v1/ppo/20260101-120000-first --steps 1M"""
+
+
+def run(words: Sequence[str]) -> Answer:
+    """Train on, and say how it went."""
+    parser = Parser("resume", "Go on with an interrupted run to its end, or with a finished one up to more steps.", EXAMPLES)
+    add_run_arguments(parser)
+    parser.add_argument("-n", "--total-timesteps", "--n-timesteps", dest="steps", type=positive_whole, help=SUPPRESS)
+    parser.add_argument("--steps", type=positive_whole, help="steps of each seed in all (default: as planned)")
+    options = parser.parse(words)
+    directory = find_run(options.run, options.output)
+    from thorndike import api
+
+    return trained(api.resume(directory, steps=options.steps, progress=not options.json))

@@ -1,0 +1,209 @@
+"""``thorndike train ALGORITHM ENVIRONMENT``: everything that can be wrong is looked at before JAX is imported."""
+
+import ast
+import os
+import shlex
+from argparse import SUPPRESS, Namespace
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from thorndike.algorithms import ALGORITHMS
+from thorndike.cli.answer import Answer
+from thorndike.cli.environment_names import check_environment
+from thorndike.cli.find_run import add_output_argument
+from thorndike.cli.parser import Parser, not_negative_whole, positive_whole
+from thorndike.errors import UserError
+from thorndike.settings import FieldFacts, parse_settings, read_config_fields
+from thorndike.suggestions import did_you_mean
+
+if TYPE_CHECKING:
+    from thorndike.api import Result
+
+ENGINES = ("auto", "native", "gymnasium", "subprocess", "envpool")
+DEVICES = ("auto", "cpu", "gpu")
+
+EXAMPLES = """\
+  thorndike train ppo CartPole-v1 --seeds 8
+  thorndike train dqn LunarLander-v3 --steps 300k --set 'learning_rate=linear(1e-3,0)'
+  thorndike train ppo HalfCheetah-v5 --engine envpool --num-envs 8 --name first-try
+  thorndike train q_learning FrozenLake-v1 --env-set is_slippery=False
+  thorndike train ppo my_module:MyEnv-v0 --seeds 4 --json
+
+every setting of an algorithm (`thorndike list settings ppo`) may also stand as a flag: --learning-rate 1e-3"""
+
+_SETTING = "setting "
+
+
+def run(words: Sequence[str]) -> Answer:
+    """Train, and say where the run is and how it went."""
+    options = _parse(words)
+    algorithm, environment = names(options)
+    settings, env_kwargs = given_settings(options, algorithm), given_env_kwargs(options.env_set)
+    check_environment(environment, engine=options.engine, env_kwargs=env_kwargs, max_episode_steps=options.max_episode_steps)
+    check_preset(algorithm, environment, options.preset)
+    _check_output(options.output)
+    from thorndike import api
+
+    result = api.train(
+        algorithm,
+        environment,
+        steps=options.steps,
+        seeds=options.seeds,
+        seed=options.seed,
+        num_envs=options.num_envs,
+        settings=settings,
+        preset=options.preset,
+        engine=options.engine,
+        device=options.device,
+        output=options.output,
+        name=options.name,
+        checkpoint_every=options.checkpoint_every,
+        max_episode_steps=options.max_episode_steps,
+        env_kwargs=env_kwargs,
+        progress=not options.json,
+        command=shlex.join(["thorndike", "train", *words]),
+    )
+    return trained(result)
+
+
+def add_training_arguments(parser: Parser, fields: Mapping[str, FieldFacts]) -> None:
+    """The arguments that say what is trained; `train` and `bench` share them."""
+    parser.add_argument("algorithm", nargs="?", metavar="ALGORITHM", help=f"one of {', '.join(ALGORITHMS)}")
+    parser.add_argument("environment", nargs="?", metavar="ENVIRONMENT", help="a Gymnasium id, or module:Id")
+    _add_old_hands_flags(parser)
+    parser.add_argument("--steps", type=positive_whole, help="environment steps of each seed: 50000, 50k, 1e6")
+    parser.add_argument("--seeds", type=positive_whole, default=1, help="independent agents trained at once (default: 1)")
+    parser.add_argument("--seed", type=not_negative_whole, default=0, help="the number everything random follows from (default: 0)")
+    parser.add_argument("--num-envs", type=positive_whole, help="environments of each seed, stepped together")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="NAME=VALUE", dest="settings", help="a setting of the algorithm; may be repeated"
+    )
+    parser.add_argument(
+        "--env-set", action="append", default=[], metavar="NAME=VALUE", help="an argument of the environment; may be repeated"
+    )
+    parser.add_argument("--max-episode-steps", type=positive_whole, metavar="STEPS", help="a time limit instead of the environment's own")
+    parser.add_argument(
+        "--preset", metavar="NAME", help="measured settings, or none (default: the environment's; `thorndike list presets`)"
+    )
+    parser.add_argument("--engine", choices=ENGINES, default="auto", help="what steps the environment (default: the fastest that can)")
+    parser.add_argument("--device", choices=DEVICES, default="auto", help="where learning is computed (default: chosen by size)")
+    taken = set(parser._option_string_actions)
+    for name in fields:
+        flag = "--" + name.replace("_", "-")
+        if flag not in taken:
+            parser.add_argument(flag, metavar="VALUE", dest=_SETTING + name, help=SUPPRESS)
+
+
+def _add_old_hands_flags(parser: Parser) -> None:
+    """What the users of Stable-Baselines3, RL Zoo and CleanRL type without thinking."""
+    parser.add_argument("--algo", help=SUPPRESS)
+    parser.add_argument("--env", "--env-id", help=SUPPRESS)
+    parser.add_argument("-n", "--total-timesteps", "--n-timesteps", "--total-steps", dest="steps", type=positive_whole, help=SUPPRESS)
+    parser.add_argument("--n-envs", dest="num_envs", type=positive_whole, help=SUPPRESS)
+
+
+def named_algorithm(words: Sequence[str]) -> str | None:
+    """The algorithm the words ask for, before they are parsed: its settings are flags too."""
+    for flag, value in zip(words, [*words, ""][1:], strict=True):
+        if flag == "--algo":
+            return value
+        if flag.startswith("--algo="):
+            return flag.partition("=")[2]
+    return next((word for word in words if word in ALGORITHMS), None)
+
+
+def names(options: Namespace) -> tuple[str, str]:
+    """Algorithm and environment, each given by its place or by its flag. Raises UserError if one is missing or unknown."""
+    places = [word for word in (options.algorithm, options.environment) if word is not None]
+    algorithm = options.algo if options.algo is not None else places.pop(0) if places else None
+    environment = options.env if options.env is not None else places.pop(0) if places else None
+    if algorithm is None:
+        raise UserError(f"which algorithm? One of {', '.join(ALGORITHMS)}, as in: thorndike train ppo CartPole-v1")
+    if algorithm not in ALGORITHMS:
+        turned = f"; the algorithm comes first: thorndike train {environment} {algorithm}" if environment in ALGORITHMS else ""
+        raise UserError(f"there is no algorithm '{algorithm}'{turned or did_you_mean(algorithm, ALGORITHMS)}")
+    if environment is None:
+        raise UserError(f"which environment? Name one, as in: thorndike train {algorithm} CartPole-v1")
+    if places:
+        raise UserError(f"did not expect '{places[0]}' beside the algorithm '{algorithm}' and the environment '{environment}'")
+    return algorithm, environment
+
+
+def given_settings(options: Namespace, algorithm: str) -> dict[str, object]:
+    """The settings of ``--set`` and of flags such as ``--learning-rate``, checked. Raises UserError."""
+    as_flags = [f"{key.removeprefix(_SETTING)}={value}" for key, value in vars(options).items() if key.startswith(_SETTING) and value]
+    known = read_config_fields(algorithm)
+    settings = parse_settings([*options.settings, *as_flags], known, algorithm)
+    if "total_steps" in settings:
+        raise UserError("the number of steps is given by --steps, not by --set total_steps")
+    return settings
+
+
+def given_env_kwargs(texts: Iterable[str]) -> dict[str, object]:
+    """``["is_slippery=False", "map_name=8x8"]`` as keyword arguments: Python literals, or else text. Raises UserError."""
+    values: dict[str, object] = {}
+    for text in texts:
+        name, equals, value = text.replace(":", "=", 1).partition("=") if "=" not in text else text.partition("=")
+        if not equals or not name.isidentifier():
+            raise UserError(f"--env-set {text}: expected NAME=VALUE, for example --env-set is_slippery=False")
+        values[name] = _literal(value)
+    return values
+
+
+def check_preset(algorithm: str, environment: str, preset: str | None) -> None:
+    """Raises UserError if the environment has no preset of this name."""
+    if preset is not None:
+        from thorndike.training.presets import find_preset
+
+        find_preset(algorithm, environment, preset)
+
+
+def trained(result: "Result") -> Answer:
+    """The answer of `train` and `resume`."""
+    data = {
+        "run": result.run,
+        "status": result.status,
+        "steps": result.steps,
+        "seeds": result.seeds,
+        "wall_s": result.wall_s,
+        "cpu_s": result.cpu_s,
+        "compile_s": result.compile_s,
+        "steps_per_s": result.steps_per_s,
+        "steps_per_cpu_s": result.steps_per_cpu_s,
+    }
+    interrupted = result.status == "interrupted"
+    verb = "resume" if interrupted else "eval"
+    seeds = "1 seed" if result.seeds == 1 else f"{result.seeds} seeds"
+    text = (
+        f"{result.status}: {result.steps:,} steps of {seeds} in {result.wall_s:.1f} s ({result.cpu_s:.1f} CPU-s, "
+        f"of which {result.compile_s:.1f} compiling): {result.steps_per_s:,.0f} steps/s\n"
+        f"mean training return at the end: {result.mean_return:.4g}\n"
+        f"run: {result.run}\n"
+        f"next: thorndike {verb} {shlex.quote(str(result.run))}"
+    )
+    return Answer(data, text, exit_status=130 if interrupted else 0)
+
+
+def _parse(words: Sequence[str]) -> Namespace:
+    parser = Parser("train", "Train an agent, or several independent seeds of it in one compiled program.", EXAMPLES)
+    algorithm = named_algorithm(words)
+    add_training_arguments(parser, read_config_fields(algorithm) if algorithm in ALGORITHMS else {})
+    add_output_argument(parser)
+    parser.add_argument("--name", help="the last part of the run directory's name")
+    parser.add_argument("--checkpoint-every", type=positive_whole, metavar="STEPS", help="steps between two checkpoints")
+    return parser.parse(words)
+
+
+def _check_output(output: Path) -> None:
+    nearest = next(folder for folder in (output.absolute(), *output.absolute().parents) if folder.exists())
+    if not nearest.is_dir() or not os.access(nearest, os.W_OK | os.X_OK):
+        what = "is not a folder" if not nearest.is_dir() else "may not be written to"
+        raise UserError(f"--output {output}: {nearest} {what}; choose another folder")
+
+
+def _literal(text: str) -> object:
+    try:
+        return ast.literal_eval(text)
+    except (ValueError, SyntaxError):
+        return text

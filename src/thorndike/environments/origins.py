@@ -1,0 +1,177 @@
+"""What a user names, as one Gymnasium environment: an id, ``module:Id``, ``path/to/file.py:ClassName``, an object or a function.
+
+Kept free of JAX: a wrong name is rejected before it is imported, and worker processes start fast.
+"""
+
+import copy
+import importlib
+import importlib.util
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import ModuleType
+from typing import TypeAlias
+
+import gymnasium
+from gymnasium.vector import VectorEnv
+from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
+
+from thorndike.errors import UserError
+
+Settings: TypeAlias = Mapping[str, object]
+"""Keyword settings of an environment."""
+
+Origin: TypeAlias = str | gymnasium.Env | Callable[..., gymnasium.Env]
+"""What one Gymnasium environment can be made from."""
+
+
+def is_known_id(name: str) -> bool:
+    """Whether Gymnasium has this id, after importing the module of ``module:Id`` or Atari's package for ``ALE/...``."""
+    module, _, id = name.rpartition(":")
+    if module:
+        _import(module, name)
+    elif id.startswith("ALE/") and importlib.util.find_spec("ale_py") is not None:
+        gymnasium.register_envs(importlib.import_module("ale_py"))
+    return id in gymnasium.registry
+
+
+def make_single(
+    origin: Origin, env_kwargs: Settings, max_episode_steps: int | None = None, render_mode: str | None = None
+) -> gymnasium.Env:
+    """One fresh Gymnasium environment; `max_episode_steps` overrides the limit it is registered with.
+
+    An object is copied, so that the one a user holds is never stepped. Raises UserError in one line if it cannot be made.
+    """
+    if isinstance(origin, str):
+        return _from_name(origin, env_kwargs, max_episode_steps, render_mode)
+    if isinstance(origin, gymnasium.Env):
+        return _limited(_copy(origin, env_kwargs, render_mode), max_episode_steps)
+    return _limited(_called(origin, env_kwargs, render_mode, getattr(origin, "__name__", "the function")), max_episode_steps)
+
+
+def name_of(origin: Origin | VectorEnv) -> str:
+    """What a run is called by: the id where there is one, else the class."""
+    if isinstance(origin, str):
+        return origin
+    spec = getattr(origin, "spec", None)
+    if spec is not None:
+        return spec.id
+    if isinstance(origin, gymnasium.Env | VectorEnv):
+        return type(origin.unwrapped).__name__
+    name = getattr(origin, "__name__", type(origin).__name__)
+    return name.strip("<>")
+
+
+def is_plain(environment: gymnasium.Env) -> bool:
+    """Whether nothing but Gymnasium's own checks and time limit is wrapped around it, so that its table says all."""
+    while isinstance(environment, gymnasium.Wrapper):
+        if type(environment) not in (OrderEnforcing, PassiveEnvChecker, TimeLimit):
+            return False
+        environment = environment.env
+    return True
+
+
+def limit_of(environment: gymnasium.Env) -> int | None:
+    """The time limit in force: the least of the wrapped ones and the registered one."""
+    limits = [] if environment.spec is None else [environment.spec.max_episode_steps]
+    while isinstance(environment, gymnasium.Wrapper):
+        if isinstance(environment, TimeLimit):
+            limits.append(environment._max_episode_steps)
+        environment = environment.env
+    return min((limit for limit in limits if limit is not None), default=None)
+
+
+def class_in_file(name: str) -> tuple[Path, str] | None:
+    """The parts of ``path/to/file.py:ClassName``, or None if `name` has not that form."""
+    path, _, attribute = name.rpartition(":")
+    return (Path(path), attribute) if path.endswith(".py") else None
+
+
+def _from_name(name: str, env_kwargs: Settings, max_episode_steps: int | None, render_mode: str | None) -> gymnasium.Env:
+    in_file = class_in_file(name)
+    if in_file is not None:
+        return _limited(_called(_attribute(_load(in_file[0]), in_file[1], name), env_kwargs, render_mode, name), max_episode_steps)
+    module, _, id = name.rpartition(":")
+    if not is_known_id(name) and module:
+        return _limited(_called(_attribute(_import(module, name), id, name), env_kwargs, render_mode, name), max_episode_steps)
+    limit = {} if max_episode_steps is None else {"max_episode_steps": max_episode_steps}
+    try:
+        # The checker costs a third of a step of CartPole, and check-env runs it once and in full.
+        return gymnasium.make(id, render_mode=render_mode, disable_env_checker=True, **limit, **env_kwargs)
+    except (gymnasium.error.Error, TypeError, ImportError) as error:
+        raise UserError(f"Gymnasium cannot make {name}: {_one_line(error)}") from error
+
+
+def _called(make: Callable[..., gymnasium.Env], env_kwargs: Settings, render_mode: str | None, name: str) -> gymnasium.Env:
+    settings = dict(env_kwargs)
+    if render_mode is not None:
+        settings["render_mode"] = render_mode
+    try:
+        environment = make(**settings)
+    except TypeError as error:
+        hint = "; give it a render_mode argument, as Gymnasium's environments have, to watch it" if render_mode is not None else ""
+        raise UserError(f"{name} cannot be made with {settings or 'no settings'}: {_one_line(error)}{hint}") from error
+    if not isinstance(environment, gymnasium.Env):
+        raise UserError(f"{name} must give a gymnasium.Env, not {type(environment).__name__}")
+    return environment
+
+
+def _copy(environment: gymnasium.Env, env_kwargs: Settings, render_mode: str | None) -> gymnasium.Env:
+    if env_kwargs:
+        raise UserError(f"settings {sorted(env_kwargs)} cannot be given to an environment that is made already: give its id or its class")
+    try:
+        copied = copy.deepcopy(environment)
+    except (TypeError, ValueError, NotImplementedError, RuntimeError) as error:
+        raise UserError(
+            f"{name_of(environment)} cannot be copied ({_one_line(error)}): give a function that makes one, such as lambda: MyEnv(...)"
+        ) from error
+    if render_mode is not None:
+        copied.unwrapped.render_mode = render_mode
+    return copied
+
+
+def _limited(environment: gymnasium.Env, max_episode_steps: int | None) -> gymnasium.Env:
+    """The limit as the outermost wrapper. Like Gymnasium's ``make``, it replaces the outermost limit already there."""
+    if max_episode_steps is None:
+        return environment
+    if isinstance(environment, TimeLimit):
+        environment = environment.env
+    return TimeLimit(environment, max_episode_steps)
+
+
+def _load(path: Path) -> ModuleType:
+    if not path.is_file():
+        raise UserError(f"there is no file {path}: give the path of the file that defines the environment's class")
+    name = f"thorndike_user_{path.stem}"
+    known = sys.modules.get(name)
+    if known is not None and known.__file__ == str(path.resolve()):
+        return known
+    spec = importlib.util.spec_from_file_location(name, path.resolve())
+    if spec is None or spec.loader is None:
+        raise UserError(f"{path} is not a Python file: give the path of the file that defines the environment's class")
+    module = importlib.util.module_from_spec(spec)
+    # Registered so that the class can be pickled and copied.
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def _import(module: str, name: str) -> ModuleType:
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        raise UserError(f"cannot import {module} of {name}: {_one_line(error)}; install it, or give path/to/file.py:ClassName") from error
+
+
+def _attribute(module: ModuleType, attribute: str, name: str) -> Callable[..., gymnasium.Env]:
+    found = getattr(module, attribute, None)
+    if not callable(found):
+        from thorndike.suggestions import did_you_mean
+
+        classes = [key for key, value in vars(module).items() if isinstance(value, type) and issubclass(value, gymnasium.Env)]
+        raise UserError(f"{name}: no environment {attribute!r} there{did_you_mean(attribute, classes)}")
+    return found
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())

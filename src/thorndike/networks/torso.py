@@ -1,0 +1,104 @@
+"""The body of a network: from an observation of any space to features, by a multilayer perceptron or, for images, convolutions first."""
+
+from collections.abc import Callable, Sequence
+
+import flax.linen as nn
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from thorndike.errors import UserError
+from thorndike.types import Observation
+
+ACTIVATIONS: dict[str, Callable[[Array], Array]] = {"tanh": nn.tanh, "relu": nn.relu, "gelu": nn.gelu, "silu": nn.silu}
+
+torch_uniform = nn.initializers.variance_scaling(1.0 / 3.0, "fan_in", "uniform")
+"""PyTorch's default for dense layers: uniform in +-1/sqrt(fan_in)."""
+
+
+class MLP(nn.Module):
+    """A multilayer perceptron: dense layers, each followed by the activation but the last one, if ``outputs`` is given."""
+
+    hidden: Sequence[int]
+    activation: str
+    kernel_init: Callable[..., Array]
+    outputs: int | None = None
+    output_init: Callable[..., Array] | None = None
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "*B F"]) -> Float[Array, "*B G"]:
+        """Features to features, or to ``outputs`` numbers."""
+        for width in self.hidden:
+            x = ACTIVATIONS[self.activation](nn.Dense(width, kernel_init=self.kernel_init)(x))
+        if self.outputs is None:
+            return x
+        return nn.Dense(self.outputs, kernel_init=self.output_init or self.kernel_init)(x)
+
+
+class CNN(nn.Module):
+    """Convolutions over an image ``[B, H, W, C]`` (NHWC) to features: Mnih et al. 2015's on large images, one 3 x 3 layer on small ones."""
+
+    features: int
+    kernel_init: Callable[..., Array]
+
+    @nn.compact
+    def __call__(self, image: Float[Array, "B H W C"]) -> Float[Array, "B F"]:
+        """Images in [0, 1] to ``features`` numbers."""
+        large = min(image.shape[1:3]) >= 36
+        layers = ((32, 8, 4), (64, 4, 2), (64, 3, 1)) if large else ((16, 3, 1),)
+        x = image
+        for channels, size, stride in layers:
+            x = nn.relu(nn.Conv(channels, (size, size), (stride, stride), padding="VALID", kernel_init=self.kernel_init)(x))
+        x = x.reshape((x.shape[0], -1))
+        return nn.relu(nn.Dense(self.features, kernel_init=self.kernel_init)(x))
+
+
+class Torso(nn.Module):
+    """Features of an observation: images through a CNN, everything else flattened, then the hidden layers."""
+
+    space: gymnasium.Space
+    hidden: Sequence[int]
+    activation: str
+    kernel_init: Callable[..., Array]
+
+    @nn.compact
+    def __call__(self, obs: Observation) -> Float[Array, "B G"]:
+        """Observation ``[B, ...]`` to features ``[B, G]``."""
+        if not is_image(self.space):
+            return MLP(self.hidden, self.activation, self.kernel_init)(flatten_observation(self.space, obs))
+        # A trailing axis turns a grey image [B, H, W] into [B, H, W, 1].
+        image = obs if obs.ndim == 4 else obs[..., None]
+        scaled = image.astype(jnp.float32) / (255.0 if image.dtype == jnp.uint8 else 1.0)
+        return CNN(self.hidden[-1] if self.hidden else 128, self.kernel_init)(scaled)
+
+
+def is_image(space: gymnasium.Space) -> bool:
+    """Whether observations are images: a Box of uint8 ``[H, W]`` or ``[H, W, C]``, or of floats with a small channel axis."""
+    if not isinstance(space, gymnasium.spaces.Box):
+        return False
+    return len(space.shape) == 3 or (len(space.shape) == 2 and space.dtype == np.uint8)
+
+
+def flatten_observation(space: gymnasium.Space, obs: Observation) -> Float[Array, "*B F"]:
+    """One row of floats per observation: Discrete parts one-hot, Box parts raveled, Dict and Tuple parts side by side.
+
+    Raises ``UserError`` for a space it does not know.
+    """
+    spaces = gymnasium.spaces
+    if isinstance(space, spaces.Box | spaces.MultiBinary):
+        leading = obs.shape[: obs.ndim - len(space.shape)]
+        return obs.reshape((*leading, -1)).astype(jnp.float32)
+    if isinstance(space, spaces.Discrete):
+        return jax.nn.one_hot(obs - int(space.start), int(space.n))
+    if isinstance(space, spaces.MultiDiscrete):
+        parts = [jax.nn.one_hot(obs[..., i], int(n)) for i, n in enumerate(space.nvec.ravel())]
+        return jnp.concatenate(parts, axis=-1)
+    if isinstance(space, spaces.Dict):
+        return jnp.concatenate([flatten_observation(part, obs[name]) for name, part in space.spaces.items()], axis=-1)
+    if isinstance(space, spaces.Tuple):
+        return jnp.concatenate([flatten_observation(part, obs[i]) for i, part in enumerate(space.spaces)], axis=-1)
+    raise UserError(
+        f"observations may be Box, Discrete, MultiDiscrete, MultiBinary, or a Dict or Tuple of these; this environment has {space}"
+    )

@@ -1,0 +1,1 @@
+"""Pictures of runs. Matplotlib is imported only when one is drawn."""

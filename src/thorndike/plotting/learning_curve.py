@@ -1,0 +1,151 @@
+"""Learning curves of one or several runs, with their 95 % interval over seeds, as PNG, SVG or PDF."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thorndike.errors import UserError
+from thorndike.statistics.estimates import mean_interval_over_seeds
+from thorndike.suggestions import did_you_mean
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Floats: TypeAlias = NDArray[np.float64]
+
+METRIC = "rollout/ep_rew_mean"
+FORMATS = (".png", ".svg", ".pdf")
+
+# Wong 2011, Nature Methods 8, 441: told apart by colour-blind readers too.
+_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+_TITLES = {
+    "rollout/ep_rew_mean": "mean return of training episodes",
+    "rollout/ep_len_mean": "mean length of training episodes (steps)",
+    "eval/mean_reward": "mean return of evaluation episodes",
+    "time/fps": "steps per second",
+}
+_STYLE = {
+    "font.size": 10.0,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": "#888888",
+    "axes.axisbelow": True,
+    "axes.grid": True,
+    "grid.color": "#E4E4E4",
+    "grid.linewidth": 0.8,
+    "xtick.color": "#555555",
+    "ytick.color": "#555555",
+    "axes.labelcolor": "#222222",
+    "legend.frameon": False,
+    "savefig.dpi": 150,
+    "svg.hashsalt": "thorndike",
+}
+
+
+class Curve(NamedTuple):
+    """One metric of one run."""
+
+    steps: Floats
+    """Environment steps of each seed at each log point ``[P]``."""
+    values: Floats
+    """The metric ``[P, S]``, NaN where a seed has none yet."""
+    algorithm: str
+    environment: str
+    name: str
+    """The run directory's own name."""
+
+
+def read_curve(run: Path, metric: str = METRIC) -> Curve:
+    """One metric of a run from its ``metrics.jsonl``; points where no seed has a value are left out.
+
+    Raises UserError if the run has logged nothing, or nothing under this name.
+    """
+    facts = json.loads((run / "run.json").read_text(encoding="utf-8"))
+    path = run / "metrics.jsonl"
+    # A run that was killed may have left half a line: whatever no newline ends is not there yet.
+    lines = path.read_text(encoding="utf-8").split("\n")[:-1] if path.is_file() else []
+    rows = [json.loads(line) for line in lines if line]
+    if not rows:
+        raise UserError(f"{run} has logged nothing yet: {path.name} is missing or empty; train longer")
+    known = {name for row in rows for name in row if name != "steps"}
+    if metric not in known:
+        raise UserError(f"{run} has no metric '{metric}'{did_you_mean(metric, known)}")
+    chosen = [row for row in rows if metric in row]
+    # What is measured of the whole run, such as time/fps, is one number and not one a seed.
+    cells = [row[metric] if isinstance(row[metric], list) else [row[metric]] for row in chosen]
+    values = np.array([[np.nan if value is None else value for value in row] for row in cells], np.float64)
+    steps = np.array([row["steps"] for row in chosen], np.float64)
+    kept = np.isfinite(values).any(axis=1)
+    if not kept.any():
+        raise UserError(f"{run}: no value of '{metric}' yet, so there is nothing to draw; train longer")
+    return Curve(steps[kept], np.where(np.isfinite(values), values, np.nan)[kept], facts["algorithm"], facts["environment"], run.name)
+
+
+def plot_learning_curves(curves: Sequence[Curve], path: Path, *, metric: str = METRIC, title: str | None = None) -> Path:
+    """Draw curves over each other (mean over seeds, shaded 95 % bootstrap interval) and write the picture; returns its path.
+
+    The ending of `path` chooses the format. Raises UserError for another ending, or if Matplotlib is not installed.
+    """
+    if path.suffix.lower() not in FORMATS:
+        raise UserError(f"a plot is written as {', '.join(FORMATS)}; got '{path.name}'")
+    try:
+        from matplotlib import style
+    except ModuleNotFoundError:
+        raise UserError("drawing needs Matplotlib: pip install 'thorndike[plot]'") from None
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with style.context(_STYLE):
+        figure = _draw(curves, metric, title)
+        figure.savefig(path, metadata={"Date": None} if path.suffix.lower() == ".svg" else None)
+    return path
+
+
+def labels(curves: Sequence[Curve]) -> list[str]:
+    """A legend entry a curve: as short as tells them apart, with the number of seeds."""
+    environments = {curve.environment for curve in curves}
+    names = [f"{curve.algorithm}" + (f" on {curve.environment}" if len(environments) > 1 else "") for curve in curves]
+    told_apart = [f"{name} ({curve.name})" if names.count(name) > 1 else name for name, curve in zip(names, curves, strict=True)]
+    return [f"{name}, {_count(curve.values.shape[1], 'seed')}" for name, curve in zip(told_apart, curves, strict=True)]
+
+
+def _draw(curves: Sequence[Curve], metric: str, title: str | None) -> "Figure":
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.0, 4.2), layout="constrained")
+    axes = figure.add_subplot()
+    for index, (curve, label) in enumerate(zip(curves, labels(curves), strict=True)):
+        _draw_one(axes, curve, label, _COLOURS[index % len(_COLOURS)], each_seed=len(curves) == 1)
+    axes.set_xlabel("environment steps of each seed")
+    axes.set_ylabel(_TITLES.get(metric, metric))
+    axes.set_xlim(left=0)
+    axes.xaxis.set_major_formatter(lambda steps, _: _short(steps))
+    axes.set_title(title or " and ".join(dict.fromkeys(curve.environment for curve in curves)), loc="left", fontweight="bold")
+    axes.legend(loc="best")
+    if any(curve.values.shape[1] > 1 for curve in curves):
+        figure.supxlabel("line: mean over seeds; band: its 95 % bootstrap interval", x=0.99, ha="right", fontsize=8, color="#777777")
+    return figure
+
+
+def _draw_one(axes: "Axes", curve: Curve, label: str, colour: str, each_seed: bool) -> None:
+    mean, low, high = mean_interval_over_seeds(curve.values)
+    if curve.values.shape[1] > 1:
+        axes.fill_between(curve.steps, low, high, color=colour, alpha=0.22, linewidth=0)
+    if curve.values.shape[1] > 1 and each_seed:
+        axes.plot(curve.steps, curve.values, color=colour, alpha=0.25, linewidth=0.6)
+    marker = "o" if len(curve.steps) == 1 else ""
+    axes.plot(curve.steps, mean, color=colour, linewidth=1.8, marker=marker, label=label)
+
+
+def _short(number: float) -> str:
+    for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if abs(number) >= size:
+            return f"{number / size:g}{letter}"
+    return f"{number:g}"
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}" + ("" if number == 1 else "s")

@@ -1,0 +1,111 @@
+"""A ring of transitions ``[N, B]`` (N steps of B environments), sampled uniformly, with n-step returns formed when sampling."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, Key, PyTree
+
+from thorndike.functional.returns import n_step_return
+from thorndike.types import Action, EnvSpec, Observation, Rollout
+
+
+class ReplayBuffer(NamedTuple):
+    """The ring. Rows ``[N, B]`` are stored flat, ``[N * B, ...]``, row ``t * B + b``."""
+
+    rows: PyTree
+    """obs, action, reward, next_obs, terminated, done, valid: ``[N * B, ...]``."""
+    position: Int[Array, ""]
+    """The step written next, in ``[0, N)``."""
+    size: Int[Array, ""]
+    """Steps stored, at most N."""
+
+
+class Transitions(NamedTuple):
+    """A sampled minibatch of (n-step) transitions ``[M, ...]``."""
+
+    obs: Observation
+    action: Action
+    reward: Float[Array, " M"]
+    """Discounted sum over the n steps."""
+    next_obs: Observation
+    discount: Float[Array, " M"]
+    """What multiplies the bootstrap value: gamma^n, or 0 after a termination."""
+    weight: Float[Array, " M"]
+    """1, or 0 for a row that is no transition."""
+
+
+def row_shapes(spec: EnvSpec) -> PyTree:
+    """One stored transition of an environment, as shapes and dtypes."""
+    obs, action = (
+        jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, jnp.asarray(x).dtype), space.sample())
+        for space in (spec.observation_space, spec.action_space)
+    )
+    flag, number = jax.ShapeDtypeStruct((), jnp.bool_), jax.ShapeDtypeStruct((), jnp.float32)
+    return {"obs": obs, "action": action, "reward": number, "next_obs": obs, "terminated": flag, "done": flag, "valid": flag}
+
+
+def init_replay(row: PyTree, steps: int, num_envs: int) -> ReplayBuffer:
+    """An empty ring for ``steps`` steps of ``num_envs`` environments, of transitions shaped as ``row`` (see ``row_shapes``)."""
+    rows = jax.tree.map(lambda x: jnp.zeros((steps * num_envs, *x.shape), x.dtype), row)
+    return ReplayBuffer(rows, jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32))
+
+
+def rows_of(rollout: Rollout) -> PyTree:
+    """The part of a rollout that replay keeps, ``[T, B, ...]``."""
+    step = rollout.step
+    return {
+        "obs": rollout.obs,
+        "action": rollout.action,
+        "reward": step.reward,
+        "next_obs": step.next_obs,
+        "terminated": step.terminated,
+        "done": step.done,
+        "valid": step.valid,
+    }
+
+
+def add(buffer: ReplayBuffer, rollout: Rollout) -> ReplayBuffer:
+    """Write ``T`` steps over the oldest ones. The number of steps in the ring must be a multiple of ``T``."""
+    new = rows_of(rollout)
+    length, num_envs = rollout.step.reward.shape
+    steps = jax.tree.leaves(buffer.rows)[0].shape[0] // num_envs
+    start = buffer.position * num_envs
+
+    def write(stored: Array, incoming: Array) -> Array:
+        flat = incoming.reshape((length * num_envs, *incoming.shape[2:]))
+        return jax.lax.dynamic_update_slice_in_dim(stored, flat.astype(stored.dtype), start, axis=0)
+
+    return ReplayBuffer(
+        rows=jax.tree.map(write, buffer.rows, new),
+        position=(buffer.position + length) % steps,
+        size=jnp.minimum(buffer.size + length, steps),
+    )
+
+
+def sample(buffer: ReplayBuffer, key: Key[Array, ""], batch_size: int, num_envs: int, n_step: int, gamma: float) -> Transitions:
+    """Draw ``batch_size`` transitions uniformly with replacement. Consumes the key.
+
+    The cost does not grow with the ring's size. With ``n_step > 1`` the newest ``n_step - 1`` steps are not drawn: what follows them is
+    not stored yet.
+    """
+    total = jax.tree.leaves(buffer.rows)[0].shape[0]
+    steps = total // num_envs
+    newest_allowed = jnp.maximum(buffer.size - (n_step - 1), 1)
+    oldest = buffer.position - buffer.size
+    # A remainder of 32 random bits is biased by less than size / 2**32, and costs a third of randint's rejection-free draw.
+    bits = jax.random.bits(key, (batch_size,), jnp.uint32)
+    drawn = (bits % (newest_allowed * num_envs).astype(jnp.uint32)).astype(jnp.int32)
+    index = (oldest * num_envs + drawn) % total
+    if n_step == 1:
+        row = jax.tree.map(lambda x: x[index], buffer.rows)
+        discount = jnp.where(row["terminated"], 0.0, gamma)
+        return Transitions(row["obs"], row["action"], row["reward"], row["next_obs"], discount, row["valid"].astype(jnp.float32))
+    window = (index[None, :] + num_envs * jnp.arange(n_step, dtype=jnp.int32)[:, None]) % (steps * num_envs)
+    reward, discount, last = n_step_return(
+        buffer.rows["reward"][window], buffer.rows["terminated"][window], buffer.rows["done"][window], gamma
+    )
+    ending = (index + num_envs * last) % total
+    first = {name: jax.tree.map(lambda x: x[index], buffer.rows[name]) for name in ("obs", "action", "valid")}
+    next_obs = jax.tree.map(lambda x: x[ending], buffer.rows["next_obs"])
+    return Transitions(first["obs"], first["action"], reward, next_obs, discount, first["valid"].astype(jnp.float32))

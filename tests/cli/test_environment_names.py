@@ -1,0 +1,39 @@
+"""The quick answer about an environment's name agrees with the slow one."""
+
+import gymnasium
+import pytest
+
+from thorndike.cli import environment_names
+from thorndike.cli.environment_names import check_environment
+from thorndike.environments.host.envpool_ids import pool_ids
+from thorndike.environments.native import NATIVE
+from thorndike.errors import UserError
+
+
+def check(name):
+    check_environment(name, engine="auto", env_kwargs={}, max_episode_steps=None)
+
+
+def test_the_ids_read_from_text_are_those_gymnasium_registers():
+    own = {id for id, spec in gymnasium.registry.items() if spec.namespace is None and "gymnasium" in str(spec.entry_point)}
+    known = environment_names._ids_without_plugins()
+    assert own <= known
+    assert known - own <= set(NATIVE) | pool_ids()
+
+
+@pytest.mark.parametrize(("name", "close"), [("CartPol-v1", "CartPole-v1"), ("Taxi-v33", "Taxi-v3"), ("halfcheetah-v5", "HalfCheetah-v5")])
+def test_a_misspelt_id_gets_the_nearest_one(name, close):
+    with pytest.raises(UserError, match=f"unknown environment '{name}'; did you mean '{close}'"):
+        check(name)
+
+
+def test_where_plugins_may_add_ids_gymnasium_is_asked(monkeypatch):
+    monkeypatch.setattr(environment_names, "_ids_without_plugins", lambda: None)
+    with pytest.raises(UserError, match="did you mean 'CartPole-v1'"):
+        check("CartPol-v1")
+    check("CartPole-v1")
+
+
+@pytest.mark.parametrize("name", ["CartPole-v1", "FrozenLake-v1", "gymnasium:Blackjack-v1"])
+def test_a_right_name_passes(name):
+    assert check(name) is None

@@ -1,0 +1,14 @@
+"""For every test: shapes and dtypes are checked as annotated, and broadcasting between ranks is an error."""
+
+import os
+
+# Before JAX, pygame and MuJoCo are imported: no display, no greeting, no device but the processor unless one is asked for.
+os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+
+import jax
+from jaxtyping import install_import_hook
+
+jax.config.update("jax_numpy_rank_promotion", "raise")
+install_import_hook(["thorndike.functional", "thorndike.networks", "thorndike.replay"], "beartype.beartype")
