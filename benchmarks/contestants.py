@@ -101,7 +101,7 @@ TASKS = (
         "4x4, slippery, alpha 0.1, gamma 0.99, epsilon 1 to 0.1 over half the run; steps of all seeds together",
         (
             thorndike("Thorndike, 1 seed", "q_learning", "--seeds", "1"),
-            thorndike("Thorndike, 64 seeds", "q_learning", "--seeds", "64"),
+            thorndike("Thorndike, 64 seeds", "q_learning", "--seeds", "64", "--steps", "200000"),
             peer("plain Python, Q in lists", "python_q_learning.py", "--table", "lists"),
             peer("plain Python, Q in NumPy", "python_q_learning.py", "--table", "numpy"),
         ),

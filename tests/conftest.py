@@ -1,11 +1,18 @@
 """For every test: shapes and dtypes are checked as annotated, and broadcasting between ranks is an error."""
 
 import os
+from pathlib import Path
 
 # Before JAX, pygame and MuJoCo are imported: no display, no greeting, no device but the processor unless one is asked for.
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
 os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
+# What is compiled stays in the checkout, so that the second `make test` is several times faster.
+os.environ.setdefault("THORNDIKE_CACHE", str(Path(__file__).parents[1] / ".cache"))
+
+from thorndike import startup
+
+startup.prepare()
 
 import jax
 from jaxtyping import install_import_hook

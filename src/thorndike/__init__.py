@@ -28,7 +28,7 @@ _PUBLIC = {
 }
 """Public name -> the module it lives in, imported when it is first used: ``import thorndike`` costs milliseconds."""
 
-__all__ = sorted(_PUBLIC)  # noqa: PLE0605
+__all__ = sorted(_PUBLIC)
 __version__ = "0.1.0"
 
 

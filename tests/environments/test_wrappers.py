@@ -111,7 +111,11 @@ def test_discretise_refuses_whole_numbers():
 def random_mdp(seed: int, states: int = 6, actions: int = 3):
     """Transition probabilities [S, A, S], rewards [S, A, S], which arrivals terminate [S, A, S]."""
     rng = np.random.default_rng(seed)
-    return rng.dirichlet(np.ones(states), (states, actions)), rng.normal(size=(states, actions, states)), rng.random((states, actions, states)) < 0.2
+    return (
+        rng.dirichlet(np.ones(states), (states, actions)),
+        rng.normal(size=(states, actions, states)),
+        rng.random((states, actions, states)) < 0.2,
+    )
 
 
 def optimal_q(probability: np.ndarray, reward: np.ndarray, terminated: np.ndarray, gamma: float) -> np.ndarray:
@@ -137,7 +141,9 @@ def test_potential_shaping_changes_every_optimal_value_by_the_potential_alone():
             phi = np.random.default_rng(seed + 1000).normal(size=6)
             wrapper = potential_shaping(lambda obs, phi=phi: jnp.asarray(phi)[obs], gamma)
             shaped = shaped_rewards(wrapper, reward, terminated)
-            difference = optimal_q(probability, shaped, terminated, gamma) - (optimal_q(probability, reward, terminated, gamma) - phi[:, None])
+            difference = optimal_q(probability, shaped, terminated, gamma) - (
+                optimal_q(probability, reward, terminated, gamma) - phi[:, None]
+            )
             worst = max(worst, np.abs(difference).max())
     assert worst < 1e-8
 
@@ -186,10 +192,10 @@ def test_observation_statistics_are_those_of_the_valid_rows_acted_on():
         statistics, memory, same = wrapper.learn(statistics, memory, rollout)
         assert same is rollout
     rows = np.concatenate(seen).astype(np.float64)
-    assert float(statistics[0].count) == len(rows)
+    assert float(statistics[0].seen) == len(rows)
     np.testing.assert_allclose(statistics[0].mean, rows.mean(0), rtol=1e-6)
     np.testing.assert_allclose(statistics[0].variance, rows.var(0), rtol=5e-2)
-    assert float(memory[0].count.sum()) == 0
+    assert float(memory[0].seen.sum()) == 0
     _, shown = wrapper.init(statistics, rows[:50].astype(np.float32))
     assert abs(float(shown.mean())) < 0.3 and 0.7 < float(shown.std()) < 1.3
 
@@ -324,7 +330,9 @@ def test_normalise_then_stack_normalises_single_frames():
 
 
 def test_an_exported_chain_is_rebuilt_and_shows_the_same():
-    wrapper = chain(normalize_reward(0.9), normalize_observation(clip=3.0), shape_reward(lambda obs, action, step: step.reward), frame_stack(2))
+    wrapper = chain(
+        normalize_reward(0.9), normalize_observation(clip=3.0), shape_reward(lambda obs, action, step: step.reward), frame_stack(2)
+    )
     spec = make_spec(spaces.Box(-np.inf, np.inf, (3,)), 4)
     observations = np.random.default_rng(0).normal(7, 1, (11, 4, 3)).astype(np.float32)
     statistics = wrapper.statistics(spec)

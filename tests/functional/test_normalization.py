@@ -24,7 +24,7 @@ def strict_ranks():
 
 def assert_moments(moments: Moments, rows: np.ndarray, rtol: float = 1e-5) -> None:
     rows = rows.astype(np.float64)
-    assert float(moments.count) == len(rows)
+    assert float(moments.seen) == len(rows)
     np.testing.assert_allclose(moments.mean, rows.mean(0), rtol=rtol, atol=1e-6)
     np.testing.assert_allclose(moments.variance, rows.var(0), rtol=rtol, atol=1e-6)
 
@@ -74,7 +74,7 @@ def test_rows_added_one_by_one_equal_numpy_and_skip_invalid_ones():
     moments = empty_moments((2,), (6,))
     for row, mask in zip(rows, valid, strict=True):
         moments = jax.jit(add_row)(moments, row, mask)
-    np.testing.assert_array_equal(moments.count, valid.sum(0))
+    np.testing.assert_array_equal(moments.seen, valid.sum(0))
     assert_moments(pool_moments(moments), rows[valid], rtol=1e-4)
 
 

@@ -1,7 +1,7 @@
 """Deep Q-network (DQN), with double, dueling and n-step targets as parts to switch on.
 
 Mnih et al. 2015, "Human-level control through deep reinforcement learning" (Nature 518); double: van Hasselt et al. 2016
-(arXiv:1509.06461); dueling: Wang et al. 2016 (arXiv:1511.06581); n-step: Hessel et al. 2018 (arXiv:1710.02298). Deviations from Mnih et al.:
+(arXiv:1509.06461); dueling: Wang et al. 2016 (arXiv:1511.06581); n-step: Hessel et al. 2018 (arXiv:1710.02298). Deviations from Mnih:
 
 1. Adam with gradients clipped by their global norm, in place of RMSProp (as in Stable-Baselines3).
 2. A step cut by a time limit bootstraps from the observation it was cut at.

@@ -30,7 +30,7 @@ from thorndike.functional.exploration import epsilon_greedy
 from thorndike.functional.row_by_row import row_by_row
 from thorndike.functional.schedules import schedule
 from thorndike.functional.state_index import state_index
-from thorndike.functional.temporal_difference import double_q_target, expected_sarsa_target, q_learning_target, sarsa_target
+from thorndike.functional.temporal_difference import double_q_target, expected_sarsa_target, q_learning_target, sarsa_target, select
 from thorndike.settings import AtLeast, Between, MoreThan, check
 from thorndike.types import Algorithm, EnvSpec, Metrics, Needs, Rollout
 
@@ -116,8 +116,7 @@ class Extras(NamedTuple):
     """Double Q: which table learns."""
 
 
-Draws: TypeAlias = tuple[Float[Array, "*batch"], Bool[Array, "*batch"]]
-"""Noise of one step: a number in [0, 1) for epsilon-greedy, the coin of double Q."""
+Draws: TypeAlias = tuple[Float[Array, "*batch"], Bool[Array, "*batch"]]  # epsilon-greedy's number in [0, 1), double Q's coin
 
 
 def q_learning(config: Config, spec: EnvSpec) -> Algorithm:
@@ -147,8 +146,8 @@ def q_learning(config: Config, spec: EnvSpec) -> Algorithm:
         return jax.random.uniform(key_explore, shape), coin
 
     def values(actor: Actor, obs: PyTree) -> Float[Array, "*batch actions"]:
-        rows = actor.q.at[number(obs)].get(mode="promise_in_bounds")
-        return (rows[..., :actions] + rows[..., actions:]) / 2.0 if double else rows
+        row = actor.q.at[number(obs)].get(mode="promise_in_bounds")
+        return (row[..., :actions] + row[..., actions:]) / 2.0 if double else row
 
     def act(actor: Actor, memory: PyTree, obs: PyTree, noise: Draws) -> tuple[PyTree, Int[Array, "*batch"], Extras]:
         choice = epsilon_greedy(values(actor, obs), actor.epsilon, noise[0], random_ties=config.random_ties)
@@ -207,20 +206,21 @@ def _learner(config: Config, sizes: tuple[int, int, int]) -> Callable[[Tables, I
     states, actions, num_envs = sizes
 
     def learn_row(tables: Tables, seed: Int[Array, ""], row: Row) -> tuple[Tables, Float[Array, ""]]:
-        now, column = row.transition, row.coin * actions + row.transition.action
-        state, successor = seed * states + now.state, seed * states + now.next_state
-        value = lax.dynamic_slice(tables.q, (state, column), (1, 1))
+        now, first = row.transition, seed * states
+        state, successor, column = first + now.state, first + now.next_state, row.coin * actions + now.action
+        # A masked sum, because XLA keeps a sum in one place: a slice read again after the update would make it copy the table every step.
+        value = select(lax.dynamic_index_in_dim(tables.q, state, keepdims=False), column)
         target = _target(config, row, lax.dynamic_index_in_dim(tables.q, successor, keepdims=False))
-        error = jnp.where(now.valid, target - value[0, 0], 0.0)
+        error = jnp.where(now.valid, target - value, 0.0)
         rate, visits = row.rate, tables.visits
         if config.visits_power > 0:
             count = lax.dynamic_slice(visits, (state, now.action), (1, 1)) + now.valid
             visits = lax.dynamic_update_slice(visits, count, (state, now.action))
             rate = rate * jnp.maximum(count[0, 0], 1).astype(jnp.float32) ** -config.visits_power
         if config.variant == "q_lambda":
-            q, traces = _trace(config, tables, row, rate * error, (seed * states, seed * num_envs + row.env))
+            q, traces = _trace(config, tables, row, rate * error, (first, seed * num_envs + row.env))
             return Tables(q, visits, traces), jnp.abs(error)
-        q = lax.dynamic_update_slice(tables.q, value + rate * error, (state, column))
+        q = lax.dynamic_update_slice(tables.q, (value + rate * error)[None, None], (state, column))
         return Tables(q, visits, ()), jnp.abs(error)
 
     return learn_row

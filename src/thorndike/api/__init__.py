@@ -1,7 +1,11 @@
 """Where algorithms, environments and training meet. The command line and the studio call only this."""
 
-from thorndike.api.learners import DQN, PPO, Learner, QLearning
-from thorndike.api.loading import LoadedPolicy, load
-from thorndike.api.training import Result, resume, runs, train
+from thorndike import startup
+
+startup.prepare()
+
+from thorndike.api.learners import DQN, PPO, Learner, QLearning  # noqa: E402
+from thorndike.api.loading import LoadedPolicy, load  # noqa: E402
+from thorndike.api.training import Result, resume, runs, train  # noqa: E402
 
 __all__ = ["DQN", "PPO", "Learner", "LoadedPolicy", "QLearning", "Result", "load", "resume", "runs", "train"]

@@ -1,14 +1,64 @@
-"""From a name and settings to an algorithm."""
+"""From what was asked for to a learner bound to its environment."""
 
+import dataclasses
 import importlib
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
 
 from thorndike.algorithms import ALGORITHMS
+from thorndike.environments import registry, wrappers
 from thorndike.errors import UserError
+from thorndike.networks.network import NetworkBuilder
+from thorndike.networks.torso import is_image
 from thorndike.suggestions import did_you_mean
-from thorndike.types import Algorithm, EnvSpec
+from thorndike.training.host_source import HostSource, host_source
+from thorndike.training.presets import Preset
+from thorndike.training.runner import Runner, runner
+from thorndike.training.session import Plan
+from thorndike.training.sources import compiled_source
+from thorndike.types import Algorithm, EnvSpec, Source, Wrapper
 
+DEFAULT_STEPS = 100_000
+DEFAULT_NUM_ENVS = {"ppo": 8, "dqn": 4, "q_learning": 1}
+LOG_POINTS = 100
+CHECKPOINTS = 10
 _WITH_NETWORK = ("ppo", "dqn")
+
+
+class Request(NamedTuple):
+    """All that defines a run, as ``run.json`` keeps it."""
+
+    algorithm: str
+    environment: str
+    env_kwargs: dict[str, object]
+    max_episode_steps: int | None
+    engine: str
+    config: dict[str, object]
+    wrappers: list[dict[str, object]]
+    """``Wrapper.settings`` of each; empty for one that holds a function of the user's."""
+    preset: str
+    steps: int
+    """Environment steps of each seed."""
+    seeds: int
+    seed: int
+    num_envs: int
+    log_every: int
+    checkpoint_every: int
+
+
+class Job(NamedTuple):
+    """A request made ready to run."""
+
+    request: Request
+    algorithm: Algorithm
+    wrapper: Wrapper
+    spec: EnvSpec
+    """The environment's own, before wrappers."""
+    source: Source | HostSource
+    runner: Runner
+    plan: Plan
+    close: Callable[[], None]
 
 
 def check_algorithm(algorithm: str) -> None:
@@ -17,17 +67,93 @@ def check_algorithm(algorithm: str) -> None:
         raise UserError(f"there is no algorithm '{algorithm}'{did_you_mean(algorithm, ALGORITHMS)}")
 
 
-def config_class(algorithm: str) -> Callable:
-    """The ``Config`` of an algorithm."""
-    return importlib.import_module(ALGORITHMS[algorithm].module).Config
+def full_config(algorithm: str, settings: Mapping[str, object]) -> dict[str, object]:
+    """Every setting of an algorithm, checked. Raises ``UserError`` for an unknown name or a value out of bounds."""
+    config_class = importlib.import_module(ALGORITHMS[algorithm].module).Config
+    known = [field.name for field in dataclasses.fields(config_class)]
+    for name in settings:
+        if name not in known:
+            raise UserError(f"{algorithm} has no setting '{name}'{did_you_mean(name, known)}")
+    return dataclasses.asdict(config_class(**{key: tuple(v) if isinstance(v, list) else v for key, v in settings.items()}))
 
 
-def build_algorithm(name: str, config: Mapping[str, object], spec: EnvSpec, network: Callable | None) -> Algorithm:
+def build_algorithm(name: str, config: Mapping[str, object], spec: EnvSpec, network: NetworkBuilder | None) -> Algorithm:
     """The algorithm ``name`` for an environment, from its settings. Raises ``UserError`` if they do not fit."""
-    factory = getattr(importlib.import_module(ALGORITHMS[name].module), name)
-    settings = config_class(name)(**{key: tuple(value) if isinstance(value, list) else value for key, value in config.items()})
+    module = importlib.import_module(ALGORITHMS[name].module)
+    factory = getattr(module, name)
+    settings = module.Config(**{key: tuple(value) if isinstance(value, list) else value for key, value in config.items()})
     if network is None:
         return factory(settings, spec)
     if name not in _WITH_NETWORK:
         raise UserError(f"{name} has no network, so it takes none; {' and '.join(_WITH_NETWORK)} do")
     return factory(settings, spec, network)
+
+
+def full_request(
+    algorithm: str,
+    choice: registry.Choice,
+    preset: Preset,
+    given: Sequence[Wrapper] | None,
+    settings: Mapping[str, object],
+    steps: int | None,
+    num_envs: int | None,
+    seeds: int,
+    seed: int,
+    checkpoint_every: int | None,
+) -> Request:
+    """What was asked for, and what the preset and the defaults add to it."""
+    steps = steps or preset.steps or DEFAULT_STEPS
+    return Request(
+        algorithm=algorithm,
+        environment=choice.id,
+        env_kwargs=dict(choice.env_kwargs),
+        max_episode_steps=choice.max_episode_steps,
+        engine=choice.engine,
+        config=full_config(algorithm, {**preset.settings, **settings, "total_steps": steps}),
+        wrappers=list(preset.wrappers) if given is None else [wrapper.settings for wrapper in given],
+        preset=preset.name,
+        steps=steps,
+        seeds=seeds,
+        seed=seed,
+        num_envs=num_envs or preset.num_envs or DEFAULT_NUM_ENVS[algorithm],
+        log_every=math.ceil(steps / LOG_POINTS),
+        checkpoint_every=checkpoint_every or math.ceil(steps / CHECKPOINTS),
+    )
+
+
+def build_job(request: Request, choice: registry.Choice, given: Sequence[Wrapper] | None, network: NetworkBuilder | None) -> Job:
+    """Bind a request to its environment, learner, source and runner."""
+    wrapper = wrappers.from_settings(request.wrappers) if given is None else wrappers.chain(*given)
+    indices = range(request.seeds)
+    if choice.engine == "native":
+        environment = registry.build_native(choice, request.num_envs)
+        algorithm, plan = _learner(request, environment.spec, wrapper, network)
+        source: Source | HostSource = compiled_source(environment, algorithm, wrapper)
+        spec, close = environment.spec, _nothing
+    else:
+        engine = registry.build_host(choice, request.num_envs * request.seeds)
+        spec, close = engine.spec._replace(num_envs=request.num_envs), engine.close
+        algorithm, plan = _learner(request, spec, wrapper, network)
+        source = host_source(engine, algorithm, wrapper, request.seed, indices, plan.checkpoint_every)
+    bound = runner(algorithm, source, request.seed, indices, plan.log_every)
+    return Job(request, algorithm, wrapper, spec, source, bound, plan, close)
+
+
+def is_large(request_algorithm: str, choice: registry.Choice) -> bool:
+    """Whether the run is large enough for an accelerator: images, that is convolutions."""
+    if request_algorithm not in _WITH_NETWORK or choice.engine == "native":
+        return False
+    probe = registry.reference(choice)
+    image = is_image(probe.observation_space)
+    probe.close()
+    return image
+
+
+def _learner(request: Request, spec: EnvSpec, wrapper: Wrapper, network: NetworkBuilder | None) -> tuple[Algorithm, Plan]:
+    algorithm = build_algorithm(request.algorithm, request.config, wrapper.spec(spec), network)
+    per_iteration = algorithm.needs.rollout_length * request.num_envs
+    return algorithm, Plan(*(max(1, math.ceil(n / per_iteration)) for n in (request.steps, request.log_every, request.checkpoint_every)))
+
+
+def _nothing() -> None:
+    """Compiled environments hold nothing to close."""

@@ -52,8 +52,10 @@ class LoadedPolicy:
 
         found = evaluate(self._policy, build, episodes, seed, num_envs or 20, deterministic)
         if self.run is not None:
-            rows = [{"evaluation_seed": seed, "deterministic": deterministic, **row._asdict()} for row in found.rows]
-            append_lines(self.run / "evaluations.jsonl", [{key.rstrip("_"): value for key, value in row.items()} for row in rows])
+            settings = {"evaluation_seed": seed, "deterministic": deterministic}
+            names = {"total": "return"}
+            rows = [{names.get(key, key): value for key, value in row._asdict().items()} for row in found.rows]
+            append_lines(self.run / "evaluations.jsonl", [settings | row for row in rows])
         return found
 
     def watch(self, path: str | Path | None = None, episodes: int = 1, seed: int = 0) -> Path | None:
@@ -88,8 +90,8 @@ def load(run: str | Path, *, environment: object | None = None, network: Callabl
     if facts["network"] == "user" and network is None:
         raise UserError(f"{run} was trained with a network of your own: load it with td.load(run, network=...)")
     wrapper = from_settings(facts["wrappers"])
-    spaces = [space_from_json(facts[name]) for name in ("observation_space", "action_space")]
-    spec = EnvSpec(facts["environment"], *spaces, num_envs=facts["num_envs"], max_episode_steps=facts["max_episode_steps"])
+    observations, actions = space_from_json(facts["observation_space"]), space_from_json(facts["action_space"])
+    spec = EnvSpec(facts["environment"], observations, actions, num_envs=facts["num_envs"], max_episode_steps=facts["max_episode_steps"])
     algorithm = build_algorithm(facts["algorithm"], facts["config"], wrapper.spec(spec), network)
     stored = load_tree(_shapes(algorithm, wrapper, spec, facts["seeds"]), folder / "policy.safetensors")
     policy = Policy(algorithm, wrapper, spec, stored["actor"], stored["statistics"], facts["best"], run)

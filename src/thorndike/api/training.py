@@ -1,6 +1,5 @@
 """``train`` and ``resume``: from what was asked for to a run directory with a trained policy."""
 
-import dataclasses
 import json
 import math
 import time
@@ -11,21 +10,21 @@ from typing import NamedTuple, TypeAlias
 import gymnasium
 
 from thorndike import startup
-from thorndike.api.building import build_algorithm, check_algorithm, config_class
+from thorndike.api.building import Job, Request, build_job, check_algorithm, full_request, is_large
+from thorndike.api.exporting import export_policy
 from thorndike.environments import registry
+from thorndike.environments.native.vectorize import Dynamics
 from thorndike.errors import UserError
-from thorndike.suggestions import did_you_mean
-from thorndike.training.presets import Preset, find_preset
-from thorndike.training.run_directory import checkpoints, facts, intact, new_run_directory, publish, read_run, write_json
+from thorndike.networks.network import NetworkBuilder
+from thorndike.training.metrics import LogPoint
+from thorndike.training.presets import find_preset
+from thorndike.training.progress import Progress
+from thorndike.training.run_directory import checkpoints, facts, intact, new_run_directory, read_run, write_json
+from thorndike.training.runner import Carry
+from thorndike.training.session import START, Outcome, Progressed, restore, run_session
+from thorndike.types import Environment, Wrapper
 
-startup.prepare()
-
-EnvironmentLike: TypeAlias = str | gymnasium.Env | Callable[[], gymnasium.Env] | gymnasium.vector.VectorEnv
-
-DEFAULT_STEPS = 100_000
-DEFAULT_NUM_ENVS = {"ppo": 8, "dqn": 4, "q_learning": 1}
-LOG_POINTS = 100
-CHECKPOINTS = 10
+EnvironmentLike: TypeAlias = str | gymnasium.Env | Callable[..., gymnasium.Env] | gymnasium.vector.VectorEnv | Environment | Dynamics
 
 
 class Result(NamedTuple):
@@ -48,25 +47,6 @@ class Result(NamedTuple):
     """Of the episodes that ended in the last log point, over all seeds; NaN if none did."""
 
 
-class Request(NamedTuple):
-    """All that defines a run, as ``run.json`` keeps it."""
-
-    algorithm: str
-    environment: str
-    env_kwargs: dict[str, object]
-    max_episode_steps: int | None
-    engine: str
-    config: dict[str, object]
-    wrappers: list[dict[str, object]]
-    preset: str
-    steps: int
-    seeds: int
-    seed: int
-    num_envs: int
-    log_every: int
-    checkpoint_every: int
-
-
 def train(
     algorithm: str,
     environment: EnvironmentLike,
@@ -83,8 +63,8 @@ def train(
     name: str | None = None,
     checkpoint_every: int | None = None,
     max_episode_steps: int | None = None,
-    wrappers: Sequence[object] | None = None,
-    network: Callable | None = None,
+    wrappers: Sequence[Wrapper] | None = None,
+    network: NetworkBuilder | None = None,
     env_kwargs: Mapping[str, object] | None = None,
     progress: bool = False,
     command: str | None = None,
@@ -100,18 +80,15 @@ def train(
     if algorithm == "planning":
         from thorndike.api.planning import plan_run
 
-        return plan_run(choice, dict(settings or {}), output, name, command)
+        return plan_run(choice, settings or {}, output, name, command)
     found = find_preset(algorithm, choice.id, preset)
-    startup.prepare(_processors(choice), device)
-    request, wrapper_objects = _request(
-        algorithm, choice, found, steps, seeds, seed, num_envs, settings, max_episode_steps, wrappers, env_kwargs, checkpoint_every
-    )
+    request = full_request(algorithm, choice, found, wrappers, settings or {}, steps, num_envs, seeds, seed, checkpoint_every)
+    backend = startup.choose_device(device, is_large(algorithm, choice))
+    job = build_job(request, choice, wrappers, network)
     run = new_run_directory(output, choice.id, algorithm, name)
-    job = _assemble(request, choice, network, wrapper_objects)
-    record = {**facts(), "status": "running", "command": command, **_as_json(request)}
-    record |= {"network": "user" if network else "default", "environment_object": not isinstance(environment, str)}
-    write_json(run / "run.json", record)
-    return _conduct(run, record, request, job, progress, fresh=True)
+    objects = {"network": "user" if network else "default", "environment_object": not isinstance(environment, str)}
+    record = {**facts(), "status": "running", "command": command, "device": backend, **objects, **_as_json(request)}
+    return _conduct(run, record, job, progress, fresh=True)
 
 
 def resume(
@@ -119,8 +96,8 @@ def resume(
     *,
     steps: int | None = None,
     environment: EnvironmentLike | None = None,
-    wrappers: Sequence[object] | None = None,
-    network: Callable | None = None,
+    wrappers: Sequence[Wrapper] | None = None,
+    network: NetworkBuilder | None = None,
     progress: bool = False,
 ) -> Result:
     """Go on with an interrupted run from its last checkpoint, or train a finished one further, to ``steps`` in all.
@@ -130,19 +107,22 @@ def resume(
     """
     run = Path(run)
     record = read_run(run)
+    if record["algorithm"] == "planning":
+        raise UserError(f"{run} is a plan: it is complete, there is nothing to resume")
+    _need_objects(run, record, environment, wrappers, network)
     request = Request(**{field: record[field] for field in Request._fields})
     if steps is not None:
         request = request._replace(steps=steps)
-    _need_objects(run, record, environment, wrappers, network)
-    startup.prepare(int(record["processors"]) if str(record.get("processors", "")).isdigit() else None)
+    processors = str(record["processors"])
+    record["device"] = startup.choose_device(record["device"], False, int(processors) if processors.isdigit() else None)
     choice = registry.resolve(
-        environment if environment is not None else request.environment,
+        request.environment if environment is None else environment,
         engine=request.engine,
         env_kwargs=request.env_kwargs,
         max_episode_steps=request.max_episode_steps,
     )
-    job = _assemble(request, choice, network, wrappers)
-    return _conduct(run, {**record, **_as_json(request), "status": "running"}, request, job, progress, fresh=False)
+    job = build_job(request, choice, wrappers, network)
+    return _conduct(run, {**record, **_as_json(request), "status": "running"}, job, progress, fresh=False)
 
 
 def runs(output: str | Path = "runs") -> list[Path]:
@@ -150,154 +130,56 @@ def runs(output: str | Path = "runs") -> list[Path]:
     return sorted((path.parent for path in Path(output).glob("*/*/*/run.json")), key=lambda path: path.name)
 
 
-def _request(
-    algorithm: str,
-    choice: registry.Choice,
-    preset: Preset,
-    steps: int | None,
-    seeds: int,
-    seed: int,
-    num_envs: int | None,
-    settings: Mapping[str, object] | None,
-    max_episode_steps: int | None,
-    wrappers: Sequence[object] | None,
-    env_kwargs: Mapping[str, object] | None,
-    checkpoint_every: int | None,
-) -> tuple[Request, Sequence[object] | None]:
-    """What was asked for and what the preset and the defaults add to it."""
-    Config = config_class(algorithm)
-    steps = steps or preset.steps or DEFAULT_STEPS
-    known = {field.name for field in dataclasses.fields(Config)}
-    chosen = {**preset.settings, **(settings or {}), "total_steps": steps}
-    for key in chosen:
-        if key not in known:
-            raise UserError(f"{algorithm} has no setting '{key}'{did_you_mean(key, known)}")
-    config = dataclasses.asdict(Config(**{key: tuple(v) if isinstance(v, list) else v for key, v in chosen.items()}))
-    envs = num_envs or preset.num_envs or DEFAULT_NUM_ENVS[algorithm]
-    described = list(preset.wrappers) if wrappers is None else [getattr(wrapper, "settings", {}) for wrapper in wrappers]
-    request = Request(
-        algorithm, choice.id, dict(env_kwargs or {}), max_episode_steps, choice.engine, config, described, preset.name, steps, seeds, seed,
-        envs, math.ceil(steps / LOG_POINTS), checkpoint_every or math.ceil(steps / CHECKPOINTS),
-    )  # fmt: skip
-    return request, wrappers
+def _conduct(run: Path, record: dict[str, object], job: Job, progress: bool, fresh: bool) -> Result:
+    """Run the session; whatever happens, ``run.json`` says how it ended."""
+    write_json(run / "run.json", record)
+    wall_began, cpu_began = time.perf_counter(), time.process_time()
 
+    def export(carry: Carry, point: LogPoint | None) -> None:
+        export_policy(run, record, job, carry, point)
 
-class Job(NamedTuple):
-    """A request made ready to run."""
-
-    algorithm: object
-    wrapper: object
-    source: object
-    runner: object
-    plan: object
-    spec: object
-    close: Callable[[], None]
-
-
-def _assemble(request: Request, choice: registry.Choice, network: Callable | None, wrapper_objects: Sequence[object] | None) -> Job:
-    from thorndike.environments import wrappers as room
-    from thorndike.training.host_source import host_source
-    from thorndike.training.runner import runner
-    from thorndike.training.session import Plan
-    from thorndike.training.sources import compiled_source
-
-    wrapper = room.from_settings(request.wrappers) if wrapper_objects is None else room.chain(*wrapper_objects)
-    indices = range(request.seeds)
-    if choice.engine == "native":
-        environment = registry.build_native(choice, request.num_envs)
-        spec = environment.spec
-    else:
-        engine = registry.build_host(choice, request.num_envs * request.seeds)
-        spec = engine.spec._replace(num_envs=request.num_envs)
-    algorithm = build_algorithm(request.algorithm, request.config, wrapper.spec(spec), network)
-    per_iteration = algorithm.needs.rollout_length * request.num_envs
-    plan = Plan(*(max(1, math.ceil(n / per_iteration)) for n in (request.steps, request.log_every, request.checkpoint_every)))
-    if choice.engine == "native":
-        source, close = compiled_source(environment, algorithm, wrapper), lambda: None
-    else:
-        source, close = host_source(engine, algorithm, wrapper, request.seed, indices, plan.checkpoint_every), engine.close
-    return Job(algorithm, wrapper, source, runner(algorithm, source, request.seed, indices, plan.log_every), plan, spec, close)
-
-
-def _conduct(run: Path, record: dict, request: Request, job: Job, progress: bool, fresh: bool) -> Result:
-    from thorndike.training.progress import Progress
-    from thorndike.training.session import START, restore, run_session
-
-    started_steps = 0
     try:
-        carry, progressed = (job.runner.init(), START) if fresh else restore(run, job.runner, job.source)
-        started_steps = progressed.iteration * job.runner.steps_per_iteration
-        write_json(run / "run.json", record)
-
-        def export(carry, point) -> None:
-            _export(run, record, request, job, carry, point)
-
-        with Progress(request.steps, progress, done_steps=started_steps) as bar:
-            outcome = run_session(run, job.runner, job.source, job.plan, carry, progressed, export, bar)
+        carry, start = (job.runner.init(), START) if fresh else restore(run, job.runner, job.source)
+        with Progress(job.request.steps, progress, done_steps=start.iteration * job.runner.steps_per_iteration) as bar:
+            before = start._replace(
+                wall_s=start.wall_s + time.perf_counter() - wall_began, cpu_s=start.cpu_s + time.process_time() - cpu_began
+            )
+            outcome = run_session(run, job.runner, job.source, job.plan, carry, before, export, bar)
     except BaseException as error:
         write_json(run / "run.json", {**record, "status": "failed", "error": f"{type(error).__name__}: {error}"})
         raise
     finally:
         job.close()
-    compile_s = job.runner.compile_seconds()
-    times = {"wall_s": outcome.wall_s, "cpu_s": outcome.cpu_s, "compile_s": compile_s, "steps_done": outcome.steps}
+    result = _result(run, job, start, outcome)
+    times = {"wall_s": outcome.wall_s, "cpu_s": outcome.cpu_s, "compile_s": result.compile_s, "steps_done": outcome.steps}
     write_json(run / "run.json", {**record, "status": outcome.status, **times})
-    made = (outcome.steps - started_steps) * request.seeds
-    wall, cpu = outcome.wall_s - progressed.wall_s, outcome.cpu_s - progressed.cpu_s
+    return result
+
+
+def _result(run: Path, job: Job, start: Progressed, outcome: Outcome) -> Result:
+    compile_s = job.runner.compile_seconds()
+    made = (outcome.steps - start.iteration * job.runner.steps_per_iteration) * job.request.seeds
+    wall, cpu = outcome.wall_s - start.wall_s, outcome.cpu_s - start.cpu_s
     returns = outcome.recent.returns if outcome.recent else []
     return Result(
-        run, outcome.status, outcome.steps, request.seeds, outcome.wall_s, outcome.cpu_s, compile_s,
-        made / max(wall - compile_s, 1e-9), made / max(cpu - compile_s, 1e-9), sum(returns) / len(returns) if returns else math.nan,
-    )  # fmt: skip
+        run=run,
+        status=outcome.status,
+        steps=outcome.steps,
+        seeds=job.request.seeds,
+        wall_s=outcome.wall_s,
+        cpu_s=outcome.cpu_s,
+        compile_s=compile_s,
+        steps_per_s=made / max(wall - job.runner.compile_wall_seconds(), 1e-9),
+        steps_per_cpu_s=made / max(cpu - compile_s, 1e-9),
+        mean_return=sum(returns) / len(returns) if returns else math.nan,
+    )
 
 
-def _export(run: Path, record: dict, request: Request, job: Job, carry: object, point: object) -> None:
-    """Write ``policy/``: actors and statistics of every seed, and all it takes to rebuild them."""
-    import shutil
-
-    import jax
-
-    from thorndike.environments.wrappers import exported
-    from thorndike.training.space_files import space_to_json
-    from thorndike.training.tree_files import save_tree
-
-    source = job.source if hasattr(job.source, "collect") else job.source.source
-    actors = jax.jit(jax.vmap(job.algorithm.actor))(carry.learner)
-    aside = run / "policy.partial"
-    shutil.rmtree(aside, ignore_errors=True)
-    aside.mkdir()
-    shown = exported(job.wrapper, source.statistics(carry.source))
-    save_tree({"actor": actors, "statistics": shown.statistics}, aside / "policy.safetensors")
-    returns = point.values["rollout/ep_rew_mean"] if point else [None] * request.seeds
-    best = max(range(request.seeds), key=lambda i: -math.inf if returns[i] is None else returns[i])
-    content = {
-        "format": 1,
-        "algorithm": request.algorithm,
-        "config": request.config,
-        "environment": request.environment,
-        "environment_object": record["environment_object"],
-        "network": record["network"],
-        "env_kwargs": request.env_kwargs,
-        "max_episode_steps": request.max_episode_steps,
-        "num_envs": request.num_envs,
-        "wrappers": shown.settings,
-        "observation_space": space_to_json(job.spec.observation_space),
-        "action_space": space_to_json(job.spec.action_space),
-        "seeds": request.seeds,
-        "best": best,
-        "time": time.time(),
-    }
-    (aside / "policy.json").write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-    publish(aside, run / "policy")
-
-
-def _processors(choice: registry.Choice) -> int | None:
-    """One processor for XLA, unless observations are images: small programs run faster, and exactly repeatably, on one."""
-    return 1
-
-
-def _need_objects(run: Path, record: dict, environment: object, wrappers: object, network: object) -> None:
-    if record.get("network") == "user" and network is None:
+def _need_objects(
+    run: Path, record: dict, environment: object | None, wrappers: Sequence[Wrapper] | None, network: NetworkBuilder | None
+) -> None:
+    """Raises ``UserError`` if something that was a Python object is not given again, or there is nothing to go on from."""
+    if record["network"] == "user" and network is None:
         raise UserError(f"{run} was trained with a network of your own: pass it again as network=...")
     if record["environment_object"] and environment is None:
         raise UserError(f"{run} was trained on an environment object: pass it again as environment=...")

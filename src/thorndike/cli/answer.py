@@ -32,7 +32,8 @@ def show(answer: Answer, as_json: bool) -> None:
     else:
         from rich.console import Console
 
-        Console(soft_wrap=not sys.stdout.isatty(), highlight=False).print(answer.text)
+        # In a pipe a row is a line, however long.
+        Console(width=None if sys.stdout.isatty() else 1_000, highlight=False).print(answer.text)
 
 
 def as_json_text(data: Mapping[str, object]) -> str:

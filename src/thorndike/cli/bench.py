@@ -34,11 +34,11 @@ def run(words: Sequence[str]) -> Answer:
     settings, env_kwargs = given_settings(options, algorithm), given_env_kwargs(options.env_set)
     check_environment(environment, engine=options.engine, env_kwargs=env_kwargs, max_episode_steps=options.max_episode_steps)
     check_preset(algorithm, environment, options.preset)
-    from thorndike import api
+    from thorndike.api import train
 
     with tempfile.TemporaryDirectory(prefix="thorndike-bench-") as folder:
         results = [
-            api.train(
+            train(
                 algorithm,
                 environment,
                 steps=options.steps,

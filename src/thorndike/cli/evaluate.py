@@ -23,9 +23,9 @@ def run(words: Sequence[str]) -> Answer:
     parser.add_argument("--stochastic", action="store_true", help="draw actions from the policy instead of taking the best one")
     options = parser.parse(words)
     directory = find_run(options.run, options.output)
-    from thorndike import api
+    from thorndike.api import load
 
-    found = api.load(directory).evaluate(
+    found = load(directory).evaluate(
         episodes=options.episodes, seed=options.seed, num_envs=options.num_envs, deterministic=not options.stochastic
     )
     data = {

@@ -21,6 +21,6 @@ def run(words: Sequence[str]) -> Answer:
     parser.add_argument("--steps", type=positive_whole, help="steps of each seed in all (default: as planned)")
     options = parser.parse(words)
     directory = find_run(options.run, options.output)
-    from thorndike import api
+    from thorndike.api import resume
 
-    return trained(api.resume(directory, steps=options.steps, progress=not options.json))
+    return trained(resume(directory, steps=options.steps, progress=not options.json))

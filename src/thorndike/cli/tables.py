@@ -14,9 +14,9 @@ def table(rows: Sequence[Mapping[str, object]]) -> "Table":
     from rich.table import Table
 
     drawn = Table(box=None, padding=(0, 2, 0, 0), header_style="bold")
-    for name in rows[0]:
+    for number, name in enumerate(rows[0]):
         is_number = any(isinstance(row[name], int | float) for row in rows)
-        drawn.add_column(name.replace("_", " "), justify="right" if is_number else "left", overflow="fold")
+        drawn.add_column(name.replace("_", " "), justify="right" if is_number else "left", overflow="fold", no_wrap=number == 0)
     for row in rows:
         drawn.add_row(*(escape(text_of(value)) for value in row.values()))
     return drawn

@@ -1,6 +1,7 @@
 """``thorndike train ALGORITHM ENVIRONMENT``: everything that can be wrong is looked at before JAX is imported."""
 
 import ast
+import math
 import os
 import shlex
 from argparse import SUPPRESS, Namespace
@@ -43,9 +44,9 @@ def run(words: Sequence[str]) -> Answer:
     check_environment(environment, engine=options.engine, env_kwargs=env_kwargs, max_episode_steps=options.max_episode_steps)
     check_preset(algorithm, environment, options.preset)
     _check_output(options.output)
-    from thorndike import api
+    from thorndike.api import train
 
-    result = api.train(
+    result = train(
         algorithm,
         environment,
         steps=options.steps,
@@ -174,15 +175,19 @@ def trained(result: "Result") -> Answer:
     }
     interrupted = result.status == "interrupted"
     verb = "resume" if interrupted else "eval"
-    seeds = "1 seed" if result.seeds == 1 else f"{result.seeds} seeds"
+    seeds = "one seed" if result.seeds == 1 else f"each of {result.seeds} seeds"
     text = (
         f"{result.status}: {result.steps:,} steps of {seeds} in {result.wall_s:.1f} s ({result.cpu_s:.1f} CPU-s, "
         f"of which {result.compile_s:.1f} compiling): {result.steps_per_s:,.0f} steps/s\n"
-        f"mean training return at the end: {result.mean_return:.4g}\n"
+        f"{_last_return(result.mean_return)}\n"
         f"run: {result.run}\n"
         f"next: thorndike {verb} {shlex.quote(str(result.run))}"
     )
     return Answer(data, text, exit_status=130 if interrupted else 0)
+
+
+def _last_return(mean_return: float) -> str:
+    return "no training episode has ended yet" if math.isnan(mean_return) else f"mean training return at the end: {mean_return:.4g}"
 
 
 def _parse(words: Sequence[str]) -> Namespace:

@@ -37,9 +37,9 @@ def run(words: Sequence[str]) -> Answer:
         # Drawing into memory needs no screen: neither SDL (classic control, Box2D) nor MuJoCo may look for one.
         os.environ["SDL_VIDEODRIVER"] = "dummy"
         os.environ.setdefault("MUJOCO_GL", "egl")
-    from thorndike import api
+    from thorndike.api import load
 
-    film = api.load(directory).watch(path, episodes=options.episodes, seed=options.seed)
+    film = load(directory).watch(path, episodes=options.episodes, seed=options.seed)
     data = {"run": directory, "video": film, "episodes": options.episodes}
     return Answer(data, "shown" if film is None else f"film: {shlex.quote(str(film))}")
 

@@ -89,7 +89,7 @@ def clipped_box(space: gymnasium.Space, clip: float) -> gymnasium.Space:
 def on_floats(function: Callable[[Array, Moments], Array], obs: Observation, moments: tuple[Moments | tuple[()], ...]) -> Observation:
     """`function` of each leaf that has moments, and the others as they are."""
     leaves, structure = jax.tree.flatten(obs)
-    return structure.unflatten([function(leaf, own) if own else leaf for leaf, own in zip(leaves, moments, strict=True)])
+    return jax.tree.unflatten(structure, [function(leaf, own) if own else leaf for leaf, own in zip(leaves, moments, strict=True)])
 
 
 def fresh_moments(like: tuple[Moments | tuple[()], ...], batch: tuple[int, ...]) -> tuple[Moments | tuple[()], ...]:

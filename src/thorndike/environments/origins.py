@@ -21,9 +21,6 @@ from thorndike.errors import UserError
 Settings: TypeAlias = Mapping[str, object]
 """Keyword settings of an environment."""
 
-Origin: TypeAlias = str | gymnasium.Env | Callable[..., gymnasium.Env]
-"""What one Gymnasium environment can be made from."""
-
 
 def is_known_id(name: str) -> bool:
     """Whether Gymnasium has this id, after importing the module of ``module:Id`` or Atari's package for ``ALE/...``."""
@@ -36,7 +33,7 @@ def is_known_id(name: str) -> bool:
 
 
 def make_single(
-    origin: Origin, env_kwargs: Settings, max_episode_steps: int | None = None, render_mode: str | None = None
+    origin: object, env_kwargs: Settings, max_episode_steps: int | None = None, render_mode: str | None = None
 ) -> gymnasium.Env:
     """One fresh Gymnasium environment; `max_episode_steps` overrides the limit it is registered with.
 
@@ -46,10 +43,14 @@ def make_single(
         return _from_name(origin, env_kwargs, max_episode_steps, render_mode)
     if isinstance(origin, gymnasium.Env):
         return _limited(_copy(origin, env_kwargs, render_mode), max_episode_steps)
-    return _limited(_called(origin, env_kwargs, render_mode, getattr(origin, "__name__", "the function")), max_episode_steps)
+    if not callable(origin):
+        raise UserError(
+            f"an environment must be an id, a gymnasium.Env, a function that makes one, a VectorEnv or a native one, not {origin!r}"
+        )
+    return _limited(_called(origin, env_kwargs, render_mode, name_of(origin)), max_episode_steps)
 
 
-def name_of(origin: Origin | VectorEnv) -> str:
+def name_of(origin: object) -> str:
     """What a run is called by: the id where there is one, else the class."""
     if isinstance(origin, str):
         return origin
@@ -94,10 +95,12 @@ def _from_name(name: str, env_kwargs: Settings, max_episode_steps: int | None, r
     module, _, id = name.rpartition(":")
     if not is_known_id(name) and module:
         return _limited(_called(_attribute(_import(module, name), id, name), env_kwargs, render_mode, name), max_episode_steps)
-    limit = {} if max_episode_steps is None else {"max_episode_steps": max_episode_steps}
+    settings = dict(env_kwargs)
+    if render_mode is not None:
+        settings["render_mode"] = render_mode
     try:
-        # The checker costs a third of a step of CartPole, and check-env runs it once and in full.
-        return gymnasium.make(id, render_mode=render_mode, disable_env_checker=True, **limit, **env_kwargs)
+        # Without the checker that looks at every step: it is for writing environments, not for training in them.
+        return gymnasium.make(id, max_episode_steps=max_episode_steps, disable_env_checker=True, **settings)
     except (gymnasium.error.Error, TypeError, ImportError) as error:
         raise UserError(f"Gymnasium cannot make {name}: {_one_line(error)}") from error
 

@@ -117,7 +117,7 @@ def reference(choice: Choice, render_mode: str | None = None) -> "gymnasium.Env"
 
     Where Gymnasium has none (a probe, an id of EnvPool alone), that engine in Gymnasium's form.
     """
-    from thorndike.environments.origins import Origin, VectorEnv, make_single
+    from thorndike.environments.origins import VectorEnv, make_single
 
     if isinstance(choice.origin, VectorEnv):
         makers = getattr(choice.origin.unwrapped, "env_fns", None)
@@ -134,8 +134,7 @@ def reference(choice: Choice, render_mode: str | None = None) -> "gymnasium.Env"
         from thorndike.environments.host.envpool_engine import PoolEnv
 
         return PoolEnv(choice.id, choice.env_kwargs, choice.max_episode_steps, render_mode)
-    origin: Origin = choice.origin
-    return make_single(origin, choice.env_kwargs, choice.max_episode_steps, render_mode)
+    return make_single(choice.origin, choice.env_kwargs, choice.max_episode_steps, render_mode)
 
 
 def environment_ids() -> dict[str, list[str]]:
@@ -184,10 +183,6 @@ def _resolve_object(environment: "Named", engine: str, settings: dict[str, objec
         if engine not in ("auto", "gymnasium") or settings or max_episode_steps is not None:
             raise UserError("a VectorEnv is built already: give engine, env_kwargs and max_episode_steps where it is built")
         return Choice(name_of(environment), "gymnasium", environment, settings, None)
-    if not callable(environment) and not hasattr(environment, "unwrapped"):
-        raise UserError(
-            f"an environment must be an id, a gymnasium.Env, a function that makes one, a VectorEnv or a native one, not {environment!r}"
-        )
     if engine == "envpool":
         raise UserError("engine='envpool' needs an id of EnvPool, not an object: use engine='gymnasium' or 'subprocess'")
     chosen = _host_or_table(environment, engine, settings)

@@ -114,7 +114,7 @@ def normalize_observation(epsilon: float = 1e-8, clip: float = 10.0) -> Wrapper:
 
     def learn(statistics: PyTree, memory: PyTree, rollout: Rollout) -> tuple[PyTree, PyTree, Rollout]:
         merged = tuple(merge_moments(old, pool_moments(new)) if old else () for old, new in zip(statistics, memory, strict=True))
-        batch = next(moments.count.shape for moments in memory if moments) if any(memory) else ()
+        batch = next(moments.seen.shape for moments in memory if moments) if any(memory) else ()
         return merged, fresh_moments(merged, batch), rollout
 
     def statistics(env_spec: EnvSpec) -> PyTree:

@@ -11,21 +11,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-
 AnyArray: TypeAlias = Array | np.ndarray
 """Rows come from compiled and from host engines."""
 
 
 class Moments(NamedTuple):
-    """How many rows were seen, their mean and their (population) variance. An empty one has count 0, mean 0 and variance 1."""
+    """How many rows were ``seen``, their mean and their (population) variance. An empty one has ``seen`` 0, mean 0 and variance 1."""
 
-    count: Float[Array, "*batch"]
+    seen: Float[Array, "*batch"]
     mean: Float[Array, "*batch_and_shape"]
     variance: Float[Array, "*batch_and_shape"]
 
 
 def empty_moments(shape: tuple[int, ...], batch: tuple[int, ...] = ()) -> Moments:
-    """No rows yet: count ``[*batch]``, mean 0 and variance 1 ``[*batch, *shape]``, so that normalising by it changes nothing."""
+    """No rows yet: ``seen`` ``[*batch]``, mean 0 and variance 1 ``[*batch, *shape]``, so that normalising by it changes nothing."""
     return Moments(jnp.zeros(batch, jnp.float32), jnp.zeros((*batch, *shape), jnp.float32), jnp.ones((*batch, *shape), jnp.float32))
 
 
@@ -41,8 +40,8 @@ def moments_of(rows: Float[AnyArray, "..."], valid: Bool[AnyArray, "*leading"]) 
 
 def merge_moments(first: Moments, second: Moments) -> Moments:
     """Moments of both groups together (Chan et al. 1979, eq. 2.1, in weights instead of sums: no overflow). Shapes as ``first``."""
-    count = first.count + second.count
-    share = _per_row(second.count / jnp.maximum(count, 1.0), first.mean.ndim)
+    count = first.seen + second.seen
+    share = _per_row(second.seen / jnp.maximum(count, 1.0), first.mean.ndim)
     distance = second.mean - first.mean
     variance = first.variance * (1.0 - share) + second.variance * share + jnp.square(distance) * share * (1.0 - share)
     return Moments(count, first.mean + distance * share, variance)
@@ -50,13 +49,13 @@ def merge_moments(first: Moments, second: Moments) -> Moments:
 
 def add_row(moments: Moments, row: Float[AnyArray, "*batch_and_shape"], valid: Bool[AnyArray, "*batch"]) -> Moments:
     """Each of a batch of moments with one more row of its own, where ``valid``: a group of one has variance 0 (Welford 1962)."""
-    return merge_moments(moments, Moments(valid.astype(jnp.float32), row, jnp.zeros_like(row)))
+    return merge_moments(moments, Moments(jnp.asarray(valid, jnp.float32), jnp.asarray(row), jnp.zeros_like(row)))
 
 
 def pool_moments(moments: Moments) -> Moments:
-    """A batch of moments ``[B, ...]`` (count ``[B]``) as one."""
-    count = jnp.sum(moments.count)
-    share = _per_row(moments.count / jnp.maximum(count, 1.0), moments.mean.ndim)
+    """A batch of moments ``[B, ...]`` (``seen`` ``[B]``) as one."""
+    count = jnp.sum(moments.seen)
+    share = _per_row(moments.seen / jnp.maximum(count, 1.0), moments.mean.ndim)
     mean = jnp.sum(share * moments.mean, axis=0)
     variance = jnp.sum(share * (moments.variance + jnp.square(moments.mean - mean[None])), axis=0)
     return Moments(count, mean, jnp.where(count > 0, variance, 1.0))
@@ -86,7 +85,7 @@ def running_returns(
         current = gamma * so_far + reward_t
         return jnp.where(done_t, 0.0, current), current
 
-    return jax.lax.scan(forward, before, (reward, done))
+    return jax.lax.scan(forward, jnp.asarray(before), (jnp.asarray(reward), jnp.asarray(done)))
 
 
 def _per_row(weight: AnyArray, ndim: int) -> AnyArray:

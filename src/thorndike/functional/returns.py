@@ -54,8 +54,8 @@ def n_step_return(
 ) -> tuple[Float[Array, "*B"], Float[Array, "*B"], Array]:
     """Sum of up to ``n`` discounted rewards that stops where the episode ends.
 
-    Returns the sum, the discount to put before the bootstrap value (0 after a termination) and the index ``int32[*B]`` of the last row used,
-    whose successor is bootstrapped from. Sutton 1988; Hessel et al. 2018 (arXiv:1710.02298), section 3.
+    Returns the sum, the discount to put before the bootstrap value (0 after a termination) and the index ``int32[*B]`` of the last row
+    used, whose successor is bootstrapped from. Sutton 1988; Hessel et al. 2018 (arXiv:1710.02298), section 3.
     """
     n = reward.shape[0]
     ended_before = jnp.concatenate([jnp.zeros_like(done[:1]), jnp.cumsum(done[:-1], axis=0) > 0])

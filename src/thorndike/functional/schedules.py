@@ -14,8 +14,8 @@ _TEXT = re.compile(r"(?P<kind>linear|cosine|exponential)\((?P<numbers>[^()]*)\)"
 def schedule(value: float | str) -> Schedule:
     """Turn a rate into a function of progress in ``[0, 1]``.
 
-    ``linear(start, end, fraction=1)`` moves from ``start`` to ``end`` over the first ``fraction`` of the run and stays there; ``cosine`` and
-    ``exponential`` take the same numbers. ``lin_3e-4`` (RL Zoo's way) is ``linear(3e-4, 0)``. Raises ``UserError`` for other text.
+    ``linear(start, end, fraction=1)`` moves from ``start`` to ``end`` over the first ``fraction`` of the run and stays there; ``cosine``
+    and ``exponential`` take the same numbers. ``lin_3e-4`` (RL Zoo's way) is ``linear(3e-4, 0)``. Raises ``UserError`` for other text.
     """
     if not isinstance(value, str):
         return lambda progress: jnp.asarray(value, jnp.float32)

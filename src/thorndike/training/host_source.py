@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Key, PyTree
 
-from thorndike.training.sources import to_environment, where_done
+from thorndike.training.acting import Acting, acting
 from thorndike.types import Algorithm, EnvSpec, EpisodeStats, Noise, Observation, Rollout, Source, Step, Wrapper
 
 
@@ -44,7 +44,7 @@ class HostSourceState(NamedTuple):
     episode_return: np.ndarray
     episode_length: np.ndarray
     collected: int
-    """Rollouts made so far: at every ``reseed_every``-th the pool is re-seeded, so that a resumed run sees what an uninterrupted one sees."""
+    """Rollouts made so far: after every ``reseed_every``-th the pool is re-seeded, so that a resumed run equals an uninterrupted one."""
 
 
 class HostSource(NamedTuple):
@@ -55,9 +55,46 @@ class HostSource(NamedTuple):
     """wrappers' statistics ``[S, ...]``, rollouts made -> the state that an uninterrupted run had there."""
 
 
-def environment_seeds(seed: int, indices: Sequence[int], num_envs: int, segment: int) -> list[int]:
+class Pool(NamedTuple):
+    """A host engine's pool seen as ``[S, B]``."""
+
+    engine: HostEngine
+    seeds: int
+    num_envs: int
+
+    def reset(self, seeds: Sequence[int]) -> Observation:
+        """First observations ``[S, B, ...]``."""
+        return jax.tree.map(self._by_seed, self.engine.reset(seeds))
+
+    def step(self, action: Array) -> Step:
+        """Actions ``[S, B, ...]`` -> Step ``[S, B, ...]``."""
+        host = np.asarray(action)
+        return jax.tree.map(self._by_seed, self.engine.step(host.reshape((self.seeds * self.num_envs, *host.shape[2:]))))
+
+    def _by_seed(self, x: np.ndarray) -> np.ndarray:
+        return x.reshape((self.seeds, self.num_envs, *x.shape[1:]))
+
+
+class Tally:
+    """Running returns and lengths of the pool's episodes ``[S, B]``, of the environments' own rewards."""
+
+    def __init__(self, episode_return: np.ndarray, episode_length: np.ndarray) -> None:
+        """Start from the episodes under way."""
+        self.total, self.age = episode_return.copy(), episode_length.copy()
+        self.sums = np.zeros((4, *self.total.shape[:1]), np.float32)
+
+    def add(self, step: Step) -> None:
+        """Count a step; episodes that end in it are summed up and start again from 0."""
+        self.total += step.reward * step.valid
+        self.age += step.valid
+        done = step.done & step.valid
+        self.sums += (done.sum(1), (self.total * done).sum(1), (self.age * done).sum(1), step.valid.sum(1))
+        self.total[done], self.age[done] = 0.0, 0
+
+
+def environment_seeds(seed: int, indices: Sequence[int], num_envs: int, stream: int) -> list[int]:
     """One 31-bit seed for each of ``len(indices) x num_envs`` environments; streams of different arguments never meet."""
-    words = [np.random.SeedSequence([seed, index, segment]).generate_state(num_envs) for index in indices]
+    words = [np.random.SeedSequence([seed, index, stream]).generate_state(num_envs) for index in indices]
     return [int(word) >> 1 for word in np.concatenate(words)]
 
 
@@ -71,75 +108,71 @@ def host_source(
     """
     seeds, length = len(indices), algorithm.needs.rollout_length
     spec = engine.spec._replace(num_envs=engine.spec.num_envs // seeds)
-    learner_spec, num_envs = wrapper.spec(spec), spec.num_envs
-    identity = not wrapper.name
-
-    def by_seed(x: np.ndarray) -> np.ndarray:
-        return x.reshape((seeds, num_envs, *x.shape[1:]))
-
-    def act_one(actor: PyTree, memory: PyTree, seen: Observation, noise: Noise, t: Array) -> tuple[PyTree, ...]:
-        memory, action, extras = algorithm.act(actor, memory, seen, jax.tree.map(lambda x: x[t], noise))
-        return memory, action, to_environment(spec.action_space, action), extras
-
-    decide = jax.jit(jax.vmap(act_one, in_axes=(0, 0, 0, 0, None)))
-    see = jax.jit(jax.vmap(wrapper.step))
-    first_sight = jax.jit(jax.vmap(wrapper.init))
-    learn = jax.jit(jax.vmap(wrapper.learn))
-    forget = jax.jit(jax.vmap(lambda done, memory: where_done(done, algorithm.memory(num_envs), memory)))
-    steps = [np.int32(t) for t in range(length)]
+    pool = Pool(engine, seeds, spec.num_envs)
+    moves = acting(algorithm, wrapper, spec.action_space, seeds, spec.num_envs)
+    learn = jax.jit(jax.vmap(wrapper.learn)) if wrapper.name else lambda *unchanged: unchanged
 
     def start(statistics: PyTree, collected: int) -> HostSourceState:
-        segment = collected // reseed_every
-        obs = jax.tree.map(by_seed, engine.reset(environment_seeds(seed, indices, num_envs, segment)))
-        wrapper_memory, seen = first_sight(statistics, obs)
-        memory = jax.tree.map(lambda x: jnp.broadcast_to(x, (seeds, *x.shape)), algorithm.memory(num_envs))
-        zeros = np.zeros((seeds, num_envs), np.float32)
-        return HostSourceState(obs, seen, memory, wrapper_memory, statistics, zeros, zeros.astype(np.int32), collected)
+        obs = pool.reset(environment_seeds(seed, indices, spec.num_envs, collected // reseed_every))
+        wrapper_memory, seen = moves.first_sight(statistics, obs)
+        zeros = np.zeros((seeds, spec.num_envs), np.float32)
+        return HostSourceState(obs, seen, moves.fresh_memory(), wrapper_memory, statistics, zeros, zeros.astype(np.int32), collected)
 
     def init(keys: Key[Array, " S"]) -> HostSourceState:
+        del keys
         statistics = jax.tree.map(lambda x: jnp.broadcast_to(x, (seeds, *jnp.shape(x))), wrapper.statistics(spec))
         return start(statistics, 0)
 
-    def draw(key: Key[Array, ""]) -> Noise:
-        return algorithm.draw(key, length)
-
     def collect(state: HostSourceState, actor: PyTree, noise: Noise) -> tuple[HostSourceState, Rollout, EpisodeStats]:
-        obs, seen, memory, wrapper_memory = state.obs, state.seen, state.memory, state.wrapper_memory
-        total, age = state.episode_return.copy(), state.episode_length.copy()
-        counts = np.zeros((4, seeds), np.float32)
-        rows, memory_before = [], memory
         collected = state.collected + 1
-        ending = collected % reseed_every == 0
-        for t in steps:
-            memory, action, engine_action, extras = decide(actor, memory, seen, noise, t)
-            host_action = np.asarray(engine_action)
-            raw = jax.tree.map(by_seed, engine.step(host_action.reshape((seeds * num_envs, *host_action.shape[2:]))))
-            if identity:
-                step = raw
-            else:
-                wrapper_memory, step = see(state.statistics, wrapper_memory, obs, engine_action, raw)
-            rows.append((seen, action, extras, step))
-            total += raw.reward * raw.valid
-            age += raw.valid
-            done = raw.done & raw.valid
-            counts += (done.sum(1), (total * done).sum(1), (age * done).sum(1), raw.valid.sum(1))
-            total[done], age[done] = 0.0, 0
-            if jax.tree.leaves(memory):
-                memory = forget(done, memory)
-            obs, seen = raw.obs, step.obs
-        if ending:
-            rows[-1] = (*rows[-1][:3], step._replace(truncated=np.asarray(step.truncated) | ~np.asarray(step.terminated)))
-        rollout = Rollout(*jax.tree.map(_stack, *rows), memory_before)
-        statistics = state.statistics
-        if not identity:
-            statistics, wrapper_memory, rollout = learn(statistics, wrapper_memory, rollout)
-        stats = EpisodeStats(*counts)
-        if ending:
-            return start(statistics, collected), rollout, stats
-        return HostSourceState(obs, seen, memory, wrapper_memory, statistics, total, age, collected), rollout, stats
+        ends_segment = collected % reseed_every == 0
+        after, rows, tally = _roll(moves, pool, state, actor, noise, length)
+        if ends_segment:
+            rows[-1] = rows[-1]._replace(step=_cut(rows[-1].step))
+        rollout = jax.tree.map(_stack, *rows)._replace(memory=state.memory)
+        statistics, wrapper_memory, rollout = learn(state.statistics, after.wrapper_memory, rollout)
+        if ends_segment:
+            return start(statistics, collected), rollout, EpisodeStats(*tally.sums)
+        following = after._replace(
+            wrapper_memory=wrapper_memory,
+            statistics=statistics,
+            episode_return=tally.total,
+            episode_length=tally.age,
+            collected=collected,
+        )
+        return following, rollout, EpisodeStats(*tally.sums)
 
-    source = Source(init, draw, collect, lambda state: state.statistics, learner_spec, compiled=False)
+    source = Source(
+        init=init,
+        draw=lambda key: algorithm.draw(key, length),
+        collect=collect,
+        statistics=lambda state: state.statistics,
+        spec=wrapper.spec(spec),
+        compiled=False,
+    )
     return HostSource(source, start)
+
+
+def _roll(
+    moves: Acting, pool: Pool, state: HostSourceState, actor: PyTree, noise: Noise, length: int
+) -> tuple[HostSourceState, list[Rollout], Tally]:
+    """``length`` steps: the observations and memories after them, a row a step, the tally of episodes."""
+    obs, seen, memory, wrapper_memory = state.obs, state.seen, state.memory, state.wrapper_memory
+    tally, rows = Tally(state.episode_return, state.episode_length), []
+    for t in range(length):
+        decision = moves.decide(actor, memory, seen, noise, np.int32(t))
+        raw = pool.step(decision.engine_action)
+        wrapper_memory, step = moves.see(state.statistics, wrapper_memory, obs, decision.engine_action, raw)
+        rows.append(Rollout(seen, decision.action, decision.extras, step, ()))
+        tally.add(raw)
+        memory = moves.forget(raw.done, decision.memory)
+        obs, seen = raw.obs, step.obs
+    return state._replace(obs=obs, seen=seen, memory=memory, wrapper_memory=wrapper_memory), rows, tally
+
+
+def _cut(step: Step) -> Step:
+    """The same step as the last of its episodes."""
+    return step._replace(truncated=np.asarray(step.truncated) | ~np.asarray(step.terminated))
 
 
 def _stack(*rows: Array | np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, Key, PyTree
 
 from thorndike.errors import UserError
 from thorndike.training.sources import to_environment
@@ -39,18 +39,11 @@ class Policy:
     @cached_property
     def seeds(self) -> Sequence["Policy"]:
         """Each agent as a policy of its own."""
-        return [
-            Policy(
-                self.algorithm,
-                self.wrapper,
-                self.spec,
-                jax.tree.map(lambda x: x[i : i + 1], self.actors),
-                jax.tree.map(lambda x: x[i : i + 1], self.statistics),
-                0,
-                self.run,
-            )
-            for i in range(self.number_of_seeds)
-        ]
+        return [self._only(i) for i in range(self.number_of_seeds)]
+
+    def _only(self, seed: int) -> "Policy":
+        actors, statistics = jax.tree.map(lambda x: x[seed : seed + 1], (self.actors, self.statistics))
+        return Policy(self.algorithm, self.wrapper, self.spec, actors, statistics, 0, self.run)
 
     def predict(self, obs: Observation, memory: PyTree = None, deterministic: bool = True) -> tuple[np.ndarray, PyTree]:
         """Action for one observation, or for a batch of them, and the memory to pass with the next ones.
@@ -68,7 +61,7 @@ class Policy:
             inner, wrapper_memory, previous = memory
             wrapper_memory, seen = self._see(statistics, wrapper_memory, previous, batch)
         self._draws += 1
-        noise = self._noise(jax.tree.leaves(batch)[0].shape[0])
+        noise = self.noise(jax.random.fold_in(jax.random.key(0), self._draws), jax.tree.leaves(batch)[0].shape[0])
         inner, action = self._decide[deterministic](actor, inner, seen, noise)
         chosen = jax.tree.map(lambda x: np.asarray(x)[0] if single else np.asarray(x), action)
         return chosen, (inner, wrapper_memory, batch)
@@ -97,9 +90,8 @@ class Policy:
     def _value(self) -> Callable:
         return jax.jit(self.algorithm.value)
 
-    def _noise(self, size: int) -> PyTree:
-        """Noise for one step of ``size`` observations: the algorithm draws for its own number of environments, so several draws are joined."""
-        key = jax.random.fold_in(jax.random.key(0), self._draws)
+    def noise(self, key: Key[Array, ""], size: int) -> PyTree:
+        """Noise ``[size, ...]`` of one decision. The algorithm draws for its own number of environments, so several draws are joined."""
         each = self.spec.num_envs
         steps = -(-size // each)
         drawn = self.algorithm.draw(key, steps)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key, PyTree
 
-from thorndike.types import Action, Algorithm, Environment, EnvSpec, EpisodeStats, Noise, Observation, Rollout, Source, Step, Wrapper
+from thorndike.types import Action, Algorithm, Environment, EpisodeStats, Noise, Observation, Rollout, Source, Step, Wrapper
 
 
 class SourceState(NamedTuple):

@@ -6,7 +6,7 @@ clipped to the space's bounds by the engine.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TypeAlias
+from typing import TYPE_CHECKING
 
 import gymnasium
 import numpy as np
@@ -14,8 +14,9 @@ from gymnasium import spaces
 
 from thorndike.errors import UserError
 
-Arrays: TypeAlias = "np.ndarray | dict[str, Arrays] | tuple[Arrays, ...]"
-"""An array, or a dict or tuple of them: a batch of observations."""
+if TYPE_CHECKING:
+    # An array, or a dict or tuple of them; jaxtyping would bring JAX.
+    from jaxtyping import PyTree
 
 PLAIN_SPACES = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 
@@ -35,7 +36,7 @@ def check_spaces(observation: gymnasium.Space, action: gymnasium.Space, name: st
         )
 
 
-def check_observation(space: gymnasium.Space, observation: object, name: str) -> None:
+def check_observation(space: gymnasium.Space, observation: "PyTree", name: str) -> None:
     """Raises UserError in one line if an observation has not the keys and shapes its space says."""
     match space:
         case spaces.Dict():
@@ -63,7 +64,7 @@ def array_dtype(dtype: np.dtype | type | None) -> np.dtype:
     return np.dtype(np.float32 if kind.kind == "f" else np.int32)
 
 
-def allocator(space: gymnasium.Space, count: int) -> Callable[[], Arrays]:
+def allocator(space: gymnasium.Space, count: int) -> "Callable[[], PyTree]":
     """A function that makes unwritten arrays for ``count`` observations of ``space``; what can be looked up once is."""
     match space:
         case spaces.Dict():
@@ -76,7 +77,7 @@ def allocator(space: gymnasium.Space, count: int) -> Callable[[], Arrays]:
     return lambda: np.empty(shape, dtype)
 
 
-def write(arrays: Arrays, row: int, observation: object) -> None:
+def write(arrays: "PyTree", row: int, observation: "PyTree") -> None:
     """One environment's observation into row ``row``, in place."""
     if isinstance(arrays, np.ndarray):
         arrays[row] = observation
@@ -88,7 +89,7 @@ def write(arrays: Arrays, row: int, observation: object) -> None:
             write(part, row, value)
 
 
-def fresh_copy(space: gymnasium.Space, batch: object) -> Arrays:
+def fresh_copy(space: gymnasium.Space, batch: "PyTree") -> "PyTree":
     """A batched observation of any dtype as new arrays of the dtypes a learner sees."""
     match space:
         case spaces.Dict():
@@ -98,7 +99,7 @@ def fresh_copy(space: gymnasium.Space, batch: object) -> Arrays:
     return np.array(batch, array_dtype(space.dtype))
 
 
-def with_rows(arrays: Arrays, rows: np.ndarray, values: Arrays) -> Arrays:
+def with_rows(arrays: "PyTree", rows: np.ndarray, values: "PyTree") -> "PyTree":
     """A copy of ``arrays`` in which ``rows`` (numbers or a mask) are ``values``."""
     match arrays:
         case dict():
@@ -110,7 +111,7 @@ def with_rows(arrays: Arrays, rows: np.ndarray, values: Arrays) -> Arrays:
     return changed
 
 
-def take(arrays: Arrays, rows: np.ndarray) -> Arrays:
+def take(arrays: "PyTree", rows: np.ndarray) -> "PyTree":
     """The chosen rows, as new arrays."""
     match arrays:
         case dict():
@@ -120,7 +121,7 @@ def take(arrays: Arrays, rows: np.ndarray) -> Arrays:
     return arrays[rows]
 
 
-def duplicate(arrays: Arrays) -> Arrays:
+def duplicate(arrays: "PyTree") -> "PyTree":
     """New arrays with the same contents."""
     match arrays:
         case dict():
@@ -139,8 +140,8 @@ def action_converter(space: gymnasium.Space) -> Callable[[np.ndarray], np.ndarra
         case spaces.Discrete() | spaces.MultiDiscrete() if np.any(space.start):
             start, whole = space.start, space.dtype
             return lambda actions: np.asarray(actions).astype(whole) + start
-    dtype = space.dtype
-    return lambda actions: np.asarray(actions).astype(dtype)
+    kind = np.dtype(space.dtype or np.int64)
+    return lambda actions: np.asarray(actions).astype(kind)
 
 
 def check_seeds(seeds: Sequence[int], num_envs: int) -> list[int]:
@@ -151,5 +152,9 @@ def check_seeds(seeds: Sequence[int], num_envs: int) -> list[int]:
 
 
 def _leaves(space: gymnasium.Space) -> list[gymnasium.Space]:
-    parts = {spaces.Dict: lambda: list(space.values()), spaces.Tuple: lambda: list(space)}.get(type(space))
-    return [space] if parts is None else [leaf for part in parts() for leaf in _leaves(part)]
+    match space:
+        case spaces.Dict():
+            return [leaf for part in space.values() for leaf in _leaves(part)]
+        case spaces.Tuple():
+            return [leaf for part in space for leaf in _leaves(part)]
+    return [space]

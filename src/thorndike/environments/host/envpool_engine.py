@@ -19,15 +19,19 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from thorndike.environments.host.arrays import Arrays, action_converter, check_seeds, check_spaces, fresh_copy, take, with_rows
+from thorndike.environments.host.arrays import action_converter, check_seeds, check_spaces, fresh_copy, take, with_rows
+from thorndike.environments.host.steps import host_step
 from thorndike.errors import UserError
-from thorndike.types import EnvSpec, Step
+from thorndike.types import EnvSpec, Observation, Step
+
+if TYPE_CHECKING:
+    from envpool import GymnasiumEnvPool
 
 NO_SETTINGS: Mapping[str, object] = MappingProxyType({})
 
@@ -63,9 +67,9 @@ class EnvPoolEngine:
         self._channels_first = own.channels_first
         self._convert = action_converter(action)
         self._threads = num_threads or min(num_envs, len(os.sched_getaffinity(0)))
-        self._pool = None
+        self._pool: GymnasiumEnvPool | None = None
 
-    def reset(self, seeds: Sequence[int]) -> Arrays:
+    def reset(self, seeds: Sequence[int]) -> Observation:
         """A new pool, every environment from its own seed (its low 31 bits): obs ``[B, ...]``."""
         import envpool
 
@@ -75,10 +79,11 @@ class EnvPoolEngine:
         self._ended = np.zeros(self.spec.num_envs, np.bool_)
         self._clock = np.zeros(self.spec.num_envs, np.int64)
         with _no_narrowing_warnings():
-            self._pool = envpool.make_gymnasium(
+            pool = envpool.make_gymnasium(
                 self.spec.id, num_envs=self.spec.num_envs, seed=seeds, num_threads=self._threads, **self._settings
             )
-            observation, _ = self._pool.reset()
+            observation, _ = pool.reset()
+        self._pool = pool
         return self._observed(observation)
 
     def step(self, actions: np.ndarray) -> Step:
@@ -91,9 +96,10 @@ class EnvPoolEngine:
         self._ended = terminated | truncated
         obs, truncated = self._keep_limit(next_obs, terminated, truncated, valid)
         cost = np.where(valid, info.get("cost", 0), 0).astype(np.float32)
-        return Step(obs, next_obs, np.where(valid, reward, 0).astype(np.float32), cost, terminated, truncated, valid)
+        reward = np.where(valid, reward, 0).astype(np.float32)
+        return host_step(obs, next_obs, reward=reward, cost=cost, terminated=terminated, truncated=truncated, valid=valid)
 
-    def render(self) -> np.ndarray:
+    def render(self) -> np.ndarray | None:
         """Pictures ``uint8[1, H, W, 3]`` of the first environment, where the settings have a ``render_mode``."""
         return self._running_pool().render()
 
@@ -101,7 +107,9 @@ class EnvPoolEngine:
         """Ends the pool and its threads."""
         self._pool = None
 
-    def _keep_limit(self, next_obs: Arrays, terminated: np.ndarray, truncated: np.ndarray, valid: np.ndarray) -> tuple[Arrays, np.ndarray]:
+    def _keep_limit(
+        self, next_obs: Observation, terminated: np.ndarray, truncated: np.ndarray, valid: np.ndarray
+    ) -> tuple[Observation, np.ndarray]:
         """Truncates at the limit kept here, where there is one, and resets what did not end by itself: next input, truncated."""
         if self._limit is None:
             return next_obs, truncated
@@ -114,12 +122,12 @@ class EnvPoolEngine:
         fresh, _ = self._running_pool().reset(cut)
         return with_rows(next_obs, cut, self._observed(fresh)), truncated
 
-    def _observed(self, observation: object) -> Arrays:
+    def _observed(self, observation: Observation) -> Observation:
         if self._channels_first:
             return np.ascontiguousarray(np.moveaxis(observation, 1, -1))
         return fresh_copy(self.spec.observation_space, observation)
 
-    def _running_pool(self) -> "gymnasium.vector.VectorEnv":
+    def _running_pool(self) -> "GymnasiumEnvPool":
         if self._pool is None:
             raise ValueError(f"the pool of {self.spec.id} is not running: call reset(seeds) first")
         return self._pool
@@ -150,7 +158,8 @@ class PoolEnv(gymnasium.Env):
 
     def render(self) -> np.ndarray | None:
         """The picture ``uint8[H, W, 3]``."""
-        return None if self.render_mode is None else self._engine.render()[0]
+        frames = None if self.render_mode is None else self._engine.render()
+        return None if frames is None else frames[0]
 
     def close(self) -> None:
         """Ends the pool."""
@@ -217,5 +226,5 @@ def _mended(space: gymnasium.Space) -> gymnasium.Space:
     return space
 
 
-def _first(arrays: Arrays) -> Arrays:
-    return take(arrays, np.int64(0))
+def _first(arrays: Observation) -> Observation:
+    return take(arrays, np.array(0))

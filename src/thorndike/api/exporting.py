@@ -1,0 +1,63 @@
+"""The exported policy of a run: actors and normaliser statistics of every seed, and all it takes to rebuild them. No code."""
+
+import json
+import math
+import shutil
+from pathlib import Path
+
+import jax
+
+from thorndike.api.building import Job
+from thorndike.environments.wrappers import exported
+from thorndike.training.host_source import HostSource
+from thorndike.training.metrics import LogPoint
+from thorndike.training.run_directory import publish
+from thorndike.training.runner import Carry
+from thorndike.training.space_files import space_to_json
+from thorndike.training.tree_files import save_tree
+
+POLICY_FORMAT = 1
+
+
+def export_policy(run: Path, record: dict[str, object], job: Job, carry: Carry, point: LogPoint | None) -> None:
+    """Write ``policy/`` aside and rename it into place. The best seed is the one with the highest return at ``point``."""
+    source = job.source.source if isinstance(job.source, HostSource) else job.source
+    shown = exported(job.wrapper, source.statistics(carry.source))
+    actors = jax.vmap(job.algorithm.actor)(carry.learner)
+    write_policy(
+        run,
+        {"actor": actors, "statistics": shown.statistics},
+        {
+            "algorithm": job.request.algorithm,
+            "config": job.request.config,
+            "network": record["network"],
+            "environment": job.request.environment,
+            "environment_object": record["environment_object"],
+            "env_kwargs": job.request.env_kwargs,
+            "max_episode_steps": job.request.max_episode_steps,
+            "num_envs": job.request.num_envs,
+            "wrappers": shown.settings,
+            "observation_space": space_to_json(job.spec.observation_space),
+            "action_space": space_to_json(job.spec.action_space),
+            "seeds": job.request.seeds,
+            "best": _best(point, job.request.seeds),
+        },
+    )
+
+
+def write_policy(run: Path, arrays: dict, content: dict[str, object]) -> None:
+    """Write arrays and description as the run's policy, replacing the one before."""
+    aside = run / "policy.partial"
+    if aside.exists():
+        shutil.rmtree(aside)
+    aside.mkdir()
+    save_tree(arrays, aside / "policy.safetensors")
+    (aside / "policy.json").write_text(json.dumps({"format": POLICY_FORMAT, **content}, indent=2) + "\n", encoding="utf-8")
+    publish(aside, run / "policy")
+
+
+def _best(point: LogPoint | None, seeds: int) -> int:
+    if point is None:
+        return 0
+    returns = [-math.inf if value is None else value for value in point.values["rollout/ep_rew_mean"]]
+    return max(range(seeds), key=returns.__getitem__)
