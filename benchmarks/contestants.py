@@ -100,15 +100,15 @@ TASKS = (
         "rate",
         "4x4, slippery, alpha 0.1, gamma 0.99, epsilon 1 to 0.1 over half the run; steps of all seeds together",
         (
-            thorndike("Thorndike, 1 seed", "q_learning", "--seeds", "1"),
-            thorndike("Thorndike, 64 seeds", "q_learning", "--seeds", "64", "--steps", "200000"),
-            peer("plain Python, Q in lists", "python_q_learning.py", "--table", "lists"),
-            peer("plain Python, Q in NumPy", "python_q_learning.py", "--table", "numpy"),
+            thorndike("Thorndike (1 seed)", "q_learning", "--seeds", "1"),
+            thorndike("Thorndike (64 seeds)", "q_learning", "--seeds", "64", "--steps", "200000"),
+            peer("plain Python (Q in lists)", "python_q_learning.py", "--table", "lists"),
+            peer("plain Python (Q in NumPy)", "python_q_learning.py", "--table", "numpy"),
         ),
         tuple(
             Claim(ours, plain, ratio)
-            for plain in ("plain Python, Q in NumPy", "plain Python, Q in lists")
-            for ours, ratio in (("Thorndike, 1 seed", 50), ("Thorndike, 64 seeds", 200))
+            for plain in ("plain Python (Q in NumPy)", "plain Python (Q in lists)")
+            for ours, ratio in (("Thorndike (1 seed)", 50), ("Thorndike (64 seeds)", 200))
         ),
     ),
     Task(
@@ -128,12 +128,12 @@ TASKS = (
         "cartpole.yaml; mean over at least the last 100 training episodes; a new seed each repetition",
         (
             thorndike_threshold(
-                "Thorndike, cold cache", "{fresh_cache}", False, "`thorndike train ppo CartPole-v1`, empty compilation cache"
+                "Thorndike (cold cache)", "{fresh_cache}", False, "`thorndike train ppo CartPole-v1`, empty compilation cache"
             ),
-            thorndike_threshold("Thorndike, warm cache", "{warm_cache}", True, "the same, after one run that filled the cache"),
+            thorndike_threshold("Thorndike (warm cache)", "{warm_cache}", True, "the same, after one run that filled the cache"),
             peer("rejax", "rejax_ppo_threshold.py"),
             peer(
-                "rejax, JAX's cache switched on",
+                "rejax (JAX's cache on)",
                 "rejax_ppo_threshold.py",
                 note="not its default: `JAX_COMPILATION_CACHE_DIR` set, after one run that filled the cache",
                 JAX_COMPILATION_CACHE_DIR="{warm_cache}/rejax",
@@ -143,8 +143,8 @@ TASKS = (
             peer("Stable-Baselines3", "sb3_ppo_threshold.py"),
         ),
         (
-            Claim("Thorndike, cold cache", measure="cpu_s", at_most=12.0),
-            Claim("Thorndike, warm cache", measure="cpu_s", at_most=6.0),
+            Claim("Thorndike (cold cache)", measure="cpu_s", at_most=12.0),
+            Claim("Thorndike (warm cache)", measure="cpu_s", at_most=6.0),
         ),
     ),
     Task(

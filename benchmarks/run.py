@@ -62,7 +62,7 @@ def measured(task: Task, finished: Finished) -> Record:
     process = {"process_wall_s": finished.wall_s, "process_cpu_s": finished.cpu_s}
     if task.kind == "startup" or line is None:
         return {**process, "wall_s": finished.wall_s, "cpu_s": finished.cpu_s, "peak_memory_mb": finished.peak_memory_mb}
-    record: Record = {**process, **line}
+    record: Record = {**process, "peak_memory_mb": finished.peak_memory_mb, **line}
     reached_at = line.get("reached_at")
     if isinstance(reached_at, float):
         record["wall_s"] = reached_at - finished.spawned_at

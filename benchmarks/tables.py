@@ -60,7 +60,7 @@ def startup_table(result: Result) -> list[str]:
 
 def label(name: str, contestant: Result) -> str:
     """The contestant's name with its note."""
-    return f"{name} ({contestant['note']})" if contestant["note"] else name
+    return f"{name}: {contestant['note']}" if contestant["note"] else name
 
 
 def claims_lines(result: Result) -> list[str]:

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from thorndike.errors import UserError
-from thorndike.plotting.learning_curve import Curve, labels, plot_learning_curves, read_curve
+from thorndike.plotting.learning_curve import Curve, carried_forward, labels, plot_learning_curves, read_curve
 
 
 def write_run(directory, rows, algorithm="ppo", environment="CartPole-v1", tail=""):
@@ -63,6 +63,12 @@ def test_a_run_with_nothing_to_draw_is_a_mistake_in_one_line(tmp_path, rows, met
     with pytest.raises(UserError, match=message) as raised:
         read_curve(write_run(tmp_path / "a", rows), metric)
     assert "\n" not in str(raised.value)
+
+
+def test_a_seed_that_ended_no_episode_keeps_its_last_value():
+    nan = np.nan
+    filled = carried_forward(np.array([[nan, 1.0], [2.0, nan], [nan, nan], [3.0, 4.0]]))
+    assert np.array_equal(filled, [[nan, 1.0], [2.0, 1.0], [2.0, 1.0], [3.0, 4.0]], equal_nan=True)
 
 
 def test_an_unknown_ending_is_refused(tmp_path):

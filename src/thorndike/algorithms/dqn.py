@@ -39,7 +39,7 @@ class Config:
     """Settings of DQN, named and preset as in Stable-Baselines3."""
 
     total_steps: Annotated[int, AtLeast(1)] = 100_000  # environment steps of the run, the measure of all schedules
-    learning_rate: float | str = 1e-4  # Adam's step size, or a schedule such as linear(1e-3, 0)
+    learning_rate: Annotated[float | str, AtLeast(0)] = 1e-4  # Adam's step size, or a schedule such as linear(1e-3, 0)
     buffer_size: Annotated[int, AtLeast(1)] = 100_000  # N: transitions kept
     learning_starts: Annotated[int, AtLeast(0)] = 1_000  # environment steps before the first update
     batch_size: Annotated[int, AtLeast(1)] = 32  # M: transitions of a minibatch

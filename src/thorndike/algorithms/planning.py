@@ -1,7 +1,7 @@
 """Planning: exact values and policies of a finite task whose transition model is known.
 
-Bellman, "Dynamic Programming" (1957): value iteration and finite horizons; Howard, "Dynamic Programming and Markov Processes" (1960): policy
-iteration. Sutton and Barto (2nd edition, 2018), chapter 4. All in float64 NumPy: a sweep of Taxi's 3,000 pairs takes 30 microseconds.
+Bellman, "Dynamic Programming" (1957): value iteration and finite horizons; Howard, "Dynamic Programming and Markov Processes" (1960):
+policy iteration. Sutton and Barto (2nd edition, 2018), chapter 4. All in float64 NumPy: a sweep over Taxi takes some 30 microseconds.
 
 Deviations and choices:
 1. ``gamma = 1`` is exact: policies are evaluated only on states from which the task can end; where it never ends the value is 0 if no
@@ -40,7 +40,7 @@ class Config:
 
 
 class Solution(NamedTuple):
-    """Values and the greedy policy. With a finite horizon H, values and policy have a leading time axis and q_values are those of step 0."""
+    """Values and the greedy policy. With a finite horizon, values and policy have a leading time axis; q_values are those of step 0."""
 
     values: Float[np.ndarray, "*time states"]
     q_values: Float[np.ndarray, "states actions"]
@@ -71,8 +71,8 @@ def action_values(table: Table, values: Float[np.ndarray, " states"], gamma: flo
 def value_iteration(table: Table, gamma: float, tolerance: float = 1e-13, max_iterations: int = 1_000_000) -> Solution:
     """Sweep ``V <- max_a Q`` from 0 until no value moves by more than `tolerance` (Sutton and Barto, section 4.4).
 
-    With gamma < 1 the values are then within ``tolerance * gamma / (1 - gamma)`` of the optimum. Raises UserError if `max_iterations` sweeps
-    do not suffice: with gamma = 1, rewards that can be collected for ever.
+    With gamma < 1 the values are then within ``tolerance * gamma / (1 - gamma)`` of the optimum, or of what float64 resolves. Raises
+    UserError if `max_iterations` sweeps do not suffice: with gamma = 1, rewards that can be collected for ever.
     """
     model, values = _Model.of(table), np.zeros(len(table.initial))
     for iteration in range(1, max_iterations + 1):
@@ -80,7 +80,7 @@ def value_iteration(table: Table, gamma: float, tolerance: float = 1e-13, max_it
         swept = q_values.max(axis=1)
         residual = float(np.abs(swept - values).max())
         values = swept
-        if residual <= tolerance * max(1.0, float(np.abs(values).max()) * 1e-1):
+        if residual <= max(tolerance, 4 * np.finfo(float).eps * float(np.abs(values).max())):
             return Solution(values, q_values, q_values.argmax(axis=1), iteration, residual)
     raise UserError(f"value iteration still moved by {residual:.3g} after {max_iterations} sweeps with gamma = {gamma}: lower gamma")
 
@@ -116,7 +116,9 @@ def policy_evaluation(
     alive = np.ones(len(reward), bool) if gamma < 1 else _can_end(transition)
     stuck = np.flatnonzero(~alive & (np.abs(reward) > 0))
     if len(stuck):
-        raise UserError(f"with gamma = 1 the policy collects rewards for ever from state {stuck[0]}: lower gamma, or give a number of steps")
+        raise UserError(
+            f"with gamma = 1 the policy collects rewards for ever from state {stuck[0]}: lower gamma, or give a number of steps"
+        )
     values = np.zeros(len(reward))
     inner = np.eye(int(alive.sum())) - gamma * transition[np.ix_(alive, alive)]
     values[alive] = np.linalg.solve(inner, reward[alive])
@@ -160,7 +162,9 @@ def _under(
     model, (states, actions) = _Model.of(table), table.probabilities.shape[:2]
     chances = np.asarray(policy, np.float64) if np.ndim(policy) == 2 else np.eye(actions)[np.asarray(policy)]
     if chances.shape != (states, actions):
-        raise UserError(f"a policy here is an action for each of {states} states or probabilities {(states, actions)}, not {np.shape(policy)}")
+        raise UserError(
+            f"a policy here is an action for each of {states} states or probabilities {(states, actions)}, not {np.shape(policy)}"
+        )
     transition = np.zeros((states, states))
     np.add.at(transition, (np.arange(states)[:, None, None], model.next_state), chances[..., None] * model.weight)
     return transition, (chances * model.expected).sum(axis=1)

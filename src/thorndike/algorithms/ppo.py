@@ -48,13 +48,13 @@ class Config:
     """Settings of PPO. Defaults are Stable-Baselines3's, but for ``n_steps``, which is for eight environments."""
 
     total_steps: Annotated[int, AtLeast(1)] = 100_000  # environment steps of the run, the measure of all schedules
-    learning_rate: float | str = 3e-4  # Adam's step size, or a schedule such as linear(3e-4, 0)
+    learning_rate: Annotated[float | str, AtLeast(0)] = 3e-4  # Adam's step size, or a schedule such as linear(3e-4, 0)
     n_steps: Annotated[int, AtLeast(1)] = 256  # T: steps of each environment in a rollout
     batch_size: Annotated[int, AtLeast(1)] = 64  # M: rows of a minibatch
     n_epochs: Annotated[int, AtLeast(1)] = 10  # K: passes over a rollout
     gamma: Annotated[float, Between(0, 1)] = 0.99  # discount
     gae_lambda: Annotated[float, Between(0, 1)] = 0.95  # lambda of the advantage estimate
-    clip_range: float | str = 0.2  # epsilon of the surrogate, or a schedule
+    clip_range: Annotated[float | str, AtLeast(0)] = 0.2  # epsilon of the surrogate, or a schedule
     clip_range_vf: Annotated[float | None, MoreThan(0)] = None  # the same for the value, off by default
     ent_coef: Annotated[float, AtLeast(0)] = 0.0  # c2: weight of the entropy bonus
     vf_coef: Annotated[float, AtLeast(0)] = 0.5  # c1: weight of the value loss

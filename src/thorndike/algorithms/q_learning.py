@@ -39,7 +39,7 @@ from thorndike.types import Algorithm, EnvSpec, Metrics, Needs, Rollout
 class Config:
     """Settings of tabular Q-learning."""
 
-    total_steps: Annotated[int, AtLeast(1)]  # environment steps of the whole run, against which schedules are measured
+    total_steps: Annotated[int, Between(1, 2**31 - 1)]  # environment steps of the whole run, against which schedules are measured
     variant: Literal["q_learning", "sarsa", "expected_sarsa", "double_q", "q_lambda"] = "q_learning"  # which target is learnt
     gamma: Annotated[float, Between(0, 1)] = 0.99  # discount (gamma)
     learning_rate: Annotated[float | str, Between(0, 1)] = 0.1  # step size (alpha)
@@ -140,8 +140,7 @@ def q_learning(config: Config, spec: EnvSpec) -> Algorithm:
         return state.iteration / jnp.float32(last_iteration)
 
     def draw(key: Key[Array, ""], steps: int) -> Draws:
-        key_explore, key_coin = jax.random.split(key)
-        shape = (steps, spec.num_envs)
+        shape, (key_explore, key_coin) = (steps, spec.num_envs), jax.random.split(key)
         coin = jax.random.bernoulli(key_coin, 0.5, shape) if double else jnp.zeros(shape, bool)
         return jax.random.uniform(key_explore, shape), coin
 
@@ -202,7 +201,6 @@ def _epsilon(config: Config, by_episodes: Float[Array, ""], progress: Float[Arra
 
 def _learner(config: Config, sizes: tuple[int, int, int]) -> Callable[[Tables, Int[Array, ""], Row], tuple[Tables, Float[Array, ""]]]:
     """One row: tables -> tables, absolute error. Only slices at scalar positions, so that XLA updates in place, in one kernel."""
-
     states, actions, num_envs = sizes
 
     def learn_row(tables: Tables, seed: Int[Array, ""], row: Row) -> tuple[Tables, Float[Array, ""]]:
@@ -214,9 +212,9 @@ def _learner(config: Config, sizes: tuple[int, int, int]) -> Callable[[Tables, I
         error = jnp.where(now.valid, target - value, 0.0)
         rate, visits = row.rate, tables.visits
         if config.visits_power > 0:
-            count = lax.dynamic_slice(visits, (state, now.action), (1, 1)) + now.valid
-            visits = lax.dynamic_update_slice(visits, count, (state, now.action))
-            rate = rate * jnp.maximum(count[0, 0], 1).astype(jnp.float32) ** -config.visits_power
+            count = select(lax.dynamic_index_in_dim(visits, state, keepdims=False), now.action) + now.valid
+            visits = lax.dynamic_update_slice(visits, count[None, None], (state, now.action))
+            rate = rate * jnp.maximum(count, 1).astype(jnp.float32) ** -config.visits_power
         if config.variant == "q_lambda":
             q, traces = _trace(config, tables, row, rate * error, (first, seed * num_envs + row.env))
             return Tables(q, visits, traces), jnp.abs(error)

@@ -6,6 +6,7 @@ startup.prepare()
 
 from thorndike.api.learners import DQN, PPO, Learner, QLearning  # noqa: E402
 from thorndike.api.loading import LoadedPolicy, load  # noqa: E402
-from thorndike.api.training import Result, resume, runs, train  # noqa: E402
+from thorndike.api.training import resume, runs, train  # noqa: E402
+from thorndike.api.training_result import Result  # noqa: E402
 
 __all__ = ["DQN", "PPO", "Learner", "LoadedPolicy", "QLearning", "Result", "load", "resume", "runs", "train"]

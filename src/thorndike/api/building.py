@@ -4,10 +4,13 @@ import dataclasses
 import importlib
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+
+import gymnasium
 
 from thorndike.algorithms import ALGORITHMS
 from thorndike.environments import registry, wrappers
+from thorndike.environments.native.vectorize import Dynamics
 from thorndike.errors import UserError
 from thorndike.networks.network import NetworkBuilder
 from thorndike.networks.torso import is_image
@@ -17,7 +20,12 @@ from thorndike.training.presets import Preset
 from thorndike.training.runner import Runner, runner
 from thorndike.training.session import Plan
 from thorndike.training.sources import compiled_source
-from thorndike.types import Algorithm, EnvSpec, Source, Wrapper
+from thorndike.types import Algorithm, Environment, EnvSpec, Source, Wrapper
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+EnvironmentLike: TypeAlias = str | gymnasium.Env | Callable[..., gymnasium.Env] | gymnasium.vector.VectorEnv | Environment | Dynamics
 
 DEFAULT_STEPS = 100_000
 DEFAULT_NUM_ENVS = {"ppo": 8, "dqn": 4, "q_learning": 1}
@@ -74,14 +82,19 @@ def full_config(algorithm: str, settings: Mapping[str, object]) -> dict[str, obj
     for name in settings:
         if name not in known:
             raise UserError(f"{algorithm} has no setting '{name}'{did_you_mean(name, known)}")
-    return dataclasses.asdict(config_class(**{key: tuple(v) if isinstance(v, list) else v for key, v in settings.items()}))
+    return dataclasses.asdict(build_config(algorithm, settings))
+
+
+def build_config(name: str, settings: Mapping[str, object]) -> "DataclassInstance":
+    """The ``Config`` of an algorithm; lists, which is what JSON and TOML make of tuples, become tuples again."""
+    config_class = importlib.import_module(ALGORITHMS[name].module).Config
+    return config_class(**{key: tuple(value) if isinstance(value, list) else value for key, value in settings.items()})
 
 
 def build_algorithm(name: str, config: Mapping[str, object], spec: EnvSpec, network: NetworkBuilder | None) -> Algorithm:
     """The algorithm ``name`` for an environment, from its settings. Raises ``UserError`` if they do not fit."""
-    module = importlib.import_module(ALGORITHMS[name].module)
-    factory = getattr(module, name)
-    settings = module.Config(**{key: tuple(value) if isinstance(value, list) else value for key, value in config.items()})
+    factory = getattr(importlib.import_module(ALGORITHMS[name].module), name)
+    settings = build_config(name, config)
     if network is None:
         return factory(settings, spec)
     if name not in _WITH_NETWORK:

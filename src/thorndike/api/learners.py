@@ -1,17 +1,22 @@
 """Algorithms as objects, for those who think in them: ``PPO("CartPole-v1", learning_rate=1e-3).learn(100_000).predict(obs)``."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import PyTree
 
+from thorndike.api.building import EnvironmentLike
 from thorndike.api.loading import LoadedPolicy, load
-from thorndike.api.training import Result, resume, train
+from thorndike.api.training import resume, train
+from thorndike.api.training_result import Result
 from thorndike.errors import UserError
+from thorndike.networks.network import NetworkBuilder
 from thorndike.settings import read_config_fields
 from thorndike.suggestions import did_you_mean
 from thorndike.training.evaluation import Evaluation
+from thorndike.types import Wrapper
 
 
 class Learner:
@@ -21,7 +26,7 @@ class Learner:
 
     def __init__(
         self,
-        environment: object,
+        environment: EnvironmentLike,
         *,
         num_envs: int | None = None,
         seeds: int = 1,
@@ -30,8 +35,8 @@ class Learner:
         engine: str = "auto",
         device: str = "auto",
         output: str | Path = "runs",
-        wrappers: Sequence[object] | None = None,
-        network: Callable | None = None,
+        wrappers: Sequence[Wrapper] | None = None,
+        network: NetworkBuilder | None = None,
         env_kwargs: dict[str, object] | None = None,
         **settings: object,
     ) -> None:
@@ -40,23 +45,39 @@ class Learner:
         for name in settings:
             if name not in known:
                 raise UserError(f"{self.algorithm} has no setting '{name}'{did_you_mean(name, known)}")
-        self._environment = environment
-        self._wrappers, self._network = wrappers, network
-        self._request = {
-            "num_envs": num_envs, "seeds": seeds, "seed": seed, "preset": preset, "engine": engine, "device": device, "output": output,
-            "env_kwargs": env_kwargs, "settings": settings,
-        }  # fmt: skip
+        self._environment, self._wrappers, self._network = environment, wrappers, network
+        self._train = partial(
+            train,
+            self.algorithm,
+            environment,
+            num_envs=num_envs,
+            seeds=seeds,
+            seed=seed,
+            settings=settings,
+            preset=preset,
+            engine=engine,
+            device=device,
+            output=output,
+            wrappers=wrappers,
+            network=network,
+            env_kwargs=env_kwargs,
+        )
         self.result: Result | None = None
         self._policy: LoadedPolicy | None = None
 
     def learn(self, steps: int | None = None, progress: bool = False) -> "Learner":
         """Train for ``steps`` environment steps of each seed; a second call trains that much further."""
-        objects = {"wrappers": self._wrappers, "network": self._network, "progress": progress}
         if self.result is None:
-            self.result = train(self.algorithm, self._environment, steps=steps, **self._request, **objects)
+            self.result = self._train(steps=steps, progress=progress)
         else:
-            further = None if steps is None else self.result.steps + steps
-            self.result = resume(self.result.run, steps=further, environment=self._environment, **objects)
+            self.result = resume(
+                self.result.run,
+                steps=None if steps is None else self.result.steps + steps,
+                environment=self._environment,
+                wrappers=self._wrappers,
+                network=self._network,
+                progress=progress,
+            )
         self._policy = None
         return self
 

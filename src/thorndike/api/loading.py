@@ -8,7 +8,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
-from thorndike.api.building import build_algorithm
+from thorndike.api.building import EnvironmentLike, build_algorithm
 from thorndike.environments import registry
 from thorndike.environments.host.gymnasium_engine import LoopEngine
 from thorndike.environments.wrappers import from_settings
@@ -25,7 +25,7 @@ from thorndike.types import Algorithm, EnvSpec, Wrapper
 class LoadedPolicy:
     """A trained policy with the environment it was trained on. With several seeds it acts as the best; ``seeds[i]`` is any other."""
 
-    def __init__(self, policy: Policy, facts: dict, environment: object | None) -> None:
+    def __init__(self, policy: Policy, facts: dict, environment: EnvironmentLike | None) -> None:
         """``facts`` is the content of policy.json; ``environment`` the object trained on, if it was no id."""
         self._policy = policy
         self.facts = facts
@@ -66,11 +66,11 @@ class LoadedPolicy:
     def _choice(self) -> registry.Choice:
         if self._environment is None and self.facts["environment_object"]:
             raise UserError(f"{self.run} was trained on an environment object: load it with td.load(run, environment=...)")
-        named = self.facts["environment"] if self._environment is None else self._environment
+        named: EnvironmentLike = self.facts["environment"] if self._environment is None else self._environment
         return registry.resolve(named, env_kwargs=self.facts["env_kwargs"], max_episode_steps=self.facts["max_episode_steps"])
 
 
-def load(run: str | Path, *, environment: object | None = None, network: Callable | None = None) -> LoadedPolicy:
+def load(run: str | Path, *, environment: EnvironmentLike | None = None, network: Callable | None = None) -> LoadedPolicy:
     """The trained policy of a run.
 
     ``environment`` and ``network`` are needed again where they were Python objects. Raises ``UserError`` if the run has no intact policy

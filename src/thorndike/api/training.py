@@ -3,17 +3,15 @@
 import json
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple, TypeAlias
-
-import gymnasium
 
 from thorndike import startup
-from thorndike.api.building import Job, Request, build_job, check_algorithm, full_request, is_large
+from thorndike.api.building import EnvironmentLike, Job, Request, build_job, check_algorithm, full_request, is_large
 from thorndike.api.exporting import export_policy
+from thorndike.api.planning import plan_run
+from thorndike.api.training_result import Result
 from thorndike.environments import registry
-from thorndike.environments.native.vectorize import Dynamics
 from thorndike.errors import UserError
 from thorndike.networks.network import NetworkBuilder
 from thorndike.training.metrics import LogPoint
@@ -22,29 +20,7 @@ from thorndike.training.progress import Progress
 from thorndike.training.run_directory import checkpoints, facts, intact, new_run_directory, read_run, write_json
 from thorndike.training.runner import Carry
 from thorndike.training.session import START, Outcome, Progressed, restore, run_session
-from thorndike.types import Environment, Wrapper
-
-EnvironmentLike: TypeAlias = str | gymnasium.Env | Callable[..., gymnasium.Env] | gymnasium.vector.VectorEnv | Environment | Dynamics
-
-
-class Result(NamedTuple):
-    """What training did."""
-
-    run: Path
-    status: str
-    """``finished`` or ``interrupted``."""
-    steps: int
-    """Environment steps of each seed."""
-    seeds: int
-    wall_s: float
-    cpu_s: float
-    compile_s: float
-    """CPU seconds of compiling, included in ``cpu_s``."""
-    steps_per_s: float
-    """Steps of all seeds per second, compiling left out."""
-    steps_per_cpu_s: float
-    mean_return: float
-    """Of the episodes that ended in the last log point, over all seeds; NaN if none did."""
+from thorndike.types import Wrapper
 
 
 def train(
@@ -78,8 +54,6 @@ def train(
     check_algorithm(algorithm)
     choice = registry.resolve(environment, engine=engine, env_kwargs=env_kwargs, max_episode_steps=max_episode_steps)
     if algorithm == "planning":
-        from thorndike.api.planning import plan_run
-
         return plan_run(choice, settings or {}, output, name, command)
     found = find_preset(algorithm, choice.id, preset)
     request = full_request(algorithm, choice, found, wrappers, settings or {}, steps, num_envs, seeds, seed, checkpoint_every)

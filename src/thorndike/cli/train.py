@@ -173,6 +173,9 @@ def trained(result: "Result") -> Answer:
         "steps_per_s": result.steps_per_s,
         "steps_per_cpu_s": result.steps_per_cpu_s,
     }
+    plan = result.run / "plan.txt"
+    if plan.exists():
+        return Answer(data, _planned(result, plan.read_text(encoding="utf-8")))
     interrupted = result.status == "interrupted"
     verb = "resume" if interrupted else "eval"
     seeds = "one seed" if result.seeds == 1 else f"each of {result.seeds} seeds"
@@ -184,6 +187,13 @@ def trained(result: "Result") -> Answer:
         f"next: thorndike {verb} {shlex.quote(str(result.run))}"
     )
     return Answer(data, text, exit_status=130 if interrupted else 0)
+
+
+def _planned(result: "Result", picture: str) -> str:
+    return (
+        f"{picture}\nplanned in {result.steps:,} sweeps, {result.wall_s:.2f} s; value of the start: {result.mean_return:.6f}\n"
+        f"run: {result.run}\nnext: thorndike eval {shlex.quote(str(result.run))}"
+    )
 
 
 def _last_return(mean_return: float) -> str:

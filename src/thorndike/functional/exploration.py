@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 
@@ -35,7 +36,7 @@ def epsilon_greedy(
     if not random_ties:
         draw = jnp.where(explores, draw, 0)
     action = (rank <= jnp.expand_dims(draw, -1)).sum(axis=-1, dtype=jnp.int32)
-    chosen = jnp.arange(q.shape[-1]) == jnp.expand_dims(action, -1)
+    chosen = lax.broadcasted_iota(jnp.int32, q.shape, q.ndim - 1) == jnp.expand_dims(action, -1)
     return Choice(action, (chosen & best).any(axis=-1))
 
 
@@ -43,5 +44,6 @@ def _running_count(mask: Bool[Array, "*batch n"]) -> Int[Array, "*batch n"]:
     """Cumulative count along the last axis."""
     # jnp.cumsum would become a reduce-window, which does not fuse; the triangle costs n squared bit operations, and n is small.
     n = mask.shape[-1]
-    triangle = jnp.arange(n)[None, :] <= jnp.arange(n)[:, None]
+    square = (*mask.shape, n)
+    triangle = lax.broadcasted_iota(jnp.int32, square, mask.ndim) <= lax.broadcasted_iota(jnp.int32, square, mask.ndim - 1)
     return (jnp.expand_dims(mask, -2) & triangle).sum(axis=-1, dtype=jnp.int32)

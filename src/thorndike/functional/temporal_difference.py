@@ -5,7 +5,8 @@ Everywhere `terminated` means that the task ended, so that the future is worth 0
 """
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int, Num
 
 
 def bootstrap(
@@ -56,8 +57,8 @@ def double_q_target(
     return bootstrap(reward, terminated, select(next_q_evaluate, next_q_select.argmax(axis=-1)), gamma)
 
 
-def select(q: Float[Array, "*batch actions"], action: Int[Array, "*batch"]) -> Float[Array, "*batch"]:
+def select(q: Num[Array, "*batch actions"], action: Int[Array, "*batch"]) -> Num[Array, "*batch"]:
     """The value of one action a row: ``q[..., action]``."""
     # A masked sum, not a gather: in a compiled CPU loop it fuses with its neighbours and stays free of bounds checks.
-    chosen = jnp.arange(q.shape[-1], dtype=action.dtype) == jnp.expand_dims(action, -1)
-    return jnp.where(chosen, q, 0.0).sum(axis=-1)
+    chosen = lax.broadcasted_iota(action.dtype, q.shape, q.ndim - 1) == jnp.expand_dims(action, -1)
+    return jnp.where(chosen, q, jnp.zeros((), q.dtype)).sum(axis=-1, dtype=q.dtype)

@@ -93,10 +93,13 @@ def flatten_observation(space: gymnasium.Space, obs: Observation) -> Float[Array
     if isinstance(space, spaces.Discrete):
         return jax.nn.one_hot(obs - int(space.start), int(space.n))
     if isinstance(space, spaces.MultiDiscrete):
-        parts = [jax.nn.one_hot(obs[..., i], int(n)) for i, n in enumerate(space.nvec.ravel())]
+        sizes, starts = space.nvec.ravel().tolist(), space.start.ravel().tolist()
+        flat = obs.reshape((*obs.shape[: obs.ndim - space.nvec.ndim], -1))
+        parts = [jax.nn.one_hot(flat[..., i] - start, n) for i, (n, start) in enumerate(zip(sizes, starts, strict=True))]
         return jnp.concatenate(parts, axis=-1)
     if isinstance(space, spaces.Dict):
-        return jnp.concatenate([flatten_observation(part, obs[name]) for name, part in space.spaces.items()], axis=-1)
+        # Sorted, because a space read back from a policy's file is: the features must not move.
+        return jnp.concatenate([flatten_observation(part, obs[name]) for name, part in sorted(space.spaces.items())], axis=-1)
     if isinstance(space, spaces.Tuple):
         return jnp.concatenate([flatten_observation(part, obs[i]) for i, part in enumerate(space.spaces)], axis=-1)
     raise UserError(

@@ -104,6 +104,16 @@ def plot_learning_curves(curves: Sequence[Curve], path: Path, *, metric: str = M
     return path
 
 
+def carried_forward(values: Floats) -> Floats:
+    """Curves ``[P, S]`` in which a seed without a value at a point keeps the one before; NaN stays before its first value.
+
+    Where episodes are longer than the distance of two log points, a mean over only the seeds that ended one there would jump about.
+    """
+    points = np.arange(len(values))[:, None]
+    latest = np.maximum.accumulate(np.where(np.isfinite(values), points, 0), axis=0)
+    return np.take_along_axis(values, latest, axis=0)
+
+
 def labels(curves: Sequence[Curve]) -> list[str]:
     """A legend entry a curve: as short as tells them apart, with the number of seeds."""
     environments = {curve.environment for curve in curves}
@@ -131,11 +141,12 @@ def _draw(curves: Sequence[Curve], metric: str, title: str | None) -> "Figure":
 
 
 def _draw_one(axes: "Axes", curve: Curve, label: str, colour: str, each_seed: bool) -> None:
-    mean, low, high = mean_interval_over_seeds(curve.values)
+    values = carried_forward(curve.values)
+    mean, low, high = mean_interval_over_seeds(values)
     if curve.values.shape[1] > 1:
         axes.fill_between(curve.steps, low, high, color=colour, alpha=0.22, linewidth=0)
     if curve.values.shape[1] > 1 and each_seed:
-        axes.plot(curve.steps, curve.values, color=colour, alpha=0.25, linewidth=0.6)
+        axes.plot(curve.steps, values, color=colour, alpha=0.25, linewidth=0.6)
     marker = "o" if len(curve.steps) == 1 else ""
     axes.plot(curve.steps, mean, color=colour, linewidth=1.8, marker=marker, label=label)
 

@@ -32,7 +32,7 @@ class Acting(NamedTuple):
     """statistics, obs -> wrapper memory, seen obs."""
     see: Callable[[PyTree, PyTree, Observation, Action, Step], tuple[PyTree, Step]]
     """statistics, wrapper memory, obs acted on, engine action, raw step -> wrapper memory, step as the learner sees it."""
-    forget: Callable[[np.ndarray, PyTree], PyTree]
+    forget: Callable[[Array | np.ndarray, PyTree], PyTree]
     """done, memory -> memory, started afresh where an episode ended."""
     fresh_memory: Callable[[], PyTree]
 
@@ -62,6 +62,6 @@ def _as_it_is(statistics: PyTree, memory: PyTree, obs: Observation, action: Acti
     return memory, step
 
 
-def _nothing_to_forget(done: np.ndarray, memory: PyTree) -> PyTree:
+def _nothing_to_forget(done: Array | np.ndarray, memory: PyTree) -> PyTree:
     del done
     return memory

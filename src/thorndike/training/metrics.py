@@ -49,9 +49,8 @@ class MetricsLog:
 
     def write(self, report: Report, steps: int) -> LogPoint:
         """Fetch a segment's report (waiting for it if need be) and log it as of ``steps`` environment steps a seed."""
-        fetched: Report = jax.tree.map(np.asarray, report)
-        episodes = fetched.episodes
-        values = {name: _numbers(value) for name, value in sorted(fetched.metrics.items())}
+        metrics, episodes = jax.tree.map(np.asarray, tuple(report))
+        values = {name: _numbers(value) for name, value in sorted(metrics.items())}
         with np.errstate(divide="ignore", invalid="ignore"):
             values["rollout/ep_rew_mean"] = _numbers(episodes.return_sum / episodes.episodes)
             values["rollout/ep_len_mean"] = _numbers(episodes.length_sum / episodes.episodes)

@@ -119,8 +119,9 @@ def _batch_axes(space: gymnasium.Space, obs: Observation) -> int:
     if isinstance(space, gymnasium.spaces.Tuple):
         _require(isinstance(obs, tuple | list) and len(obs) == len(space.spaces), space, obs)
         return max(_batch_axes(part, obs[i]) for i, part in enumerate(space.spaces))
-    axes = np.ndim(obs) - len(space.shape)
-    _require(axes in (0, 1) and np.shape(obs)[axes:] == space.shape, space, obs)
+    shape = space.shape or ()
+    axes = np.ndim(obs) - len(shape)
+    _require(axes in (0, 1) and np.shape(obs)[axes:] == shape, space, obs)
     return axes
 
 

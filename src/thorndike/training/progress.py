@@ -5,8 +5,9 @@ from types import TracebackType
 from typing import Self
 
 from rich.console import Console
-from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as Bar
+from rich.table import Column
 
 
 class Progress:
@@ -21,9 +22,11 @@ class Progress:
         self._bar: Bar | None = None
         screen = console if console is not None else Console(file=sys.stderr)
         if enabled and screen.is_terminal:
-            columns = (BarColumn(bar_width=None), TaskProgressColumn(), TextColumn("{task.description}"))
-            self._bar = Bar(*columns, TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(), console=screen, expand=True)
-            self._task = self._bar.add_task("compiling", total=total_steps, completed=done_steps)
+            # The bar takes what the words leave, so that these fit into 80 columns.
+            columns = (BarColumn(None, table_column=Column(ratio=1)), _words("{task.description}"), TimeRemainingColumn(), _words("left"))
+            self._bar = Bar(*columns, console=screen, expand=True)
+            start = describe(total_steps, done_steps, None, None, None)
+            self._task = self._bar.add_task(f"{start} · compiling", total=total_steps, completed=done_steps)
             self._bar.start()
 
     def update(
@@ -44,6 +47,10 @@ class Progress:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         self.close()
+
+
+def _words(text: str) -> TextColumn:
+    return TextColumn(text, table_column=Column(no_wrap=True))
 
 
 def describe(total: int, steps: int, mean_return: float | None, interval: tuple[float, float] | None, steps_per_s: float | None) -> str:

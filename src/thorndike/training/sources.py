@@ -9,7 +9,7 @@ import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Key, PyTree
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from thorndike.types import Action, Algorithm, Environment, EpisodeStats, Noise, Observation, Rollout, Source, Step, Wrapper
 
@@ -31,12 +31,16 @@ class SourceState(NamedTuple):
 
 
 class Emitted(NamedTuple):
-    """One step's row of a compiled rollout, before the constant columns are put back."""
+    """One step's row of a compiled rollout: what is constant, or follows from the next row, is put back after the scan."""
 
     seen: Observation
     action: Action
     extras: PyTree
-    step: Step
+    next_seen: Observation
+    reward: Float[Array, "*batch"]
+    terminated: Bool[Array, "*batch"]
+    truncated: Bool[Array, "*batch"]
+    action_mask: Bool[Array, "*batch n"] | None
     finished_return: Float[Array, "*batch"]
     finished_length: Float[Array, "*batch"]
 
@@ -48,7 +52,8 @@ def to_environment(space: gymnasium.Space, action: Action) -> Action:
     """
     if not isinstance(space, gymnasium.spaces.Box) or not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
         return action
-    low, high = space.low.astype(np.float32), space.high.astype(np.float32)
+    leading = (1,) * (action.ndim - space.low.ndim)
+    low, high = (bound.astype(np.float32).reshape(leading + bound.shape) for bound in (space.low, space.high))
     return low + (jnp.clip(action, -1.0, 1.0) + 1.0) * (0.5 * (high - low))
 
 
@@ -87,12 +92,15 @@ def compiled_source(environment: Environment, algorithm: Algorithm, wrapper: Wra
         wrapper_memory, step = wrapper.step(state.statistics, state.wrapper_memory, state.obs, engine_action, raw)
         done = raw.done
         total, steps = state.episode_return + raw.reward, state.episode_length + 1
-        # Compiled engines reset within the step, so every row is a transition: constant columns are put back after the scan.
         emitted = Emitted(
             state.seen,
             action,
             extras,
-            step._replace(obs=(), cost=(), valid=()),
+            step.next_obs,
+            step.reward,
+            step.terminated,
+            step.truncated,
+            step.action_mask,
             jnp.where(done, total, 0.0),
             jnp.where(done, steps, 0).astype(jnp.float32),
         )
@@ -110,16 +118,24 @@ def compiled_source(environment: Environment, algorithm: Algorithm, wrapper: Wra
             emitted = jax.tree.map(lambda x: x[None], emitted)
         else:
             state, emitted = jax.lax.scan(lambda carry, row: one_step(carry, actor, row), state, noise)
-        reward = emitted.step.reward
         last_seen = jax.tree.map(lambda x: x[None], state.seen)
-        following = jax.tree.map(lambda rows, last: jnp.concatenate([rows[1:], last]), emitted.seen, last_seen)
-        step = emitted.step._replace(obs=following, cost=jnp.zeros_like(reward), valid=jnp.ones(reward.shape, bool))
+        # Compiled engines reset within the step, so every row is a transition.
+        step = Step(
+            obs=jax.tree.map(lambda rows, last: jnp.concatenate([rows[1:], last]), emitted.seen, last_seen),
+            next_obs=emitted.next_seen,
+            reward=emitted.reward,
+            cost=jnp.zeros_like(emitted.reward),
+            terminated=emitted.terminated,
+            truncated=emitted.truncated,
+            valid=jnp.ones(emitted.reward.shape, bool),
+            action_mask=emitted.action_mask,
+        )
         rollout = Rollout(emitted.seen, emitted.action, emitted.extras, step, memory)
         stats = EpisodeStats(
             episodes=jnp.sum(step.done, dtype=jnp.float32),
             return_sum=jnp.sum(emitted.finished_return),
             length_sum=jnp.sum(emitted.finished_length),
-            steps=jnp.full((), reward.size, jnp.float32),
+            steps=jnp.full((), emitted.reward.size, jnp.float32),
         )
         statistics, wrapper_memory, rollout = wrapper.learn(state.statistics, state.wrapper_memory, rollout)
         return state._replace(statistics=statistics, wrapper_memory=wrapper_memory), rollout, stats

@@ -16,7 +16,7 @@ def space_to_json(space: spaces.Space) -> Json:
         case spaces.Discrete():
             return {"kind": "Discrete", "n": int(space.n), "start": int(space.start)}
         case spaces.MultiDiscrete():
-            return {"kind": "MultiDiscrete", "nvec": space.nvec.tolist()}
+            return {"kind": "MultiDiscrete", "nvec": space.nvec.tolist(), "start": space.start.tolist()}
         case spaces.MultiBinary():
             return {"kind": "MultiBinary", "shape": list(space.shape)}
         case spaces.Box():
@@ -39,11 +39,11 @@ def space_from_json(content: Json) -> spaces.Space:
     match content:
         case {"kind": "Discrete", "n": int(n), "start": int(start)}:
             return spaces.Discrete(n, start=start)
-        case {"kind": "MultiDiscrete", "nvec": list(nvec)}:
-            return spaces.MultiDiscrete(np.array(nvec))
+        case {"kind": "MultiDiscrete", "nvec": list(nvec), "start": list(start)}:
+            return spaces.MultiDiscrete(np.array(nvec), start=np.array(start))
         case {"kind": "MultiBinary", "shape": list(shape)}:
             return spaces.MultiBinary(tuple(shape))
-        case {"kind": "Box", "low": low, "high": high, "shape": list(shape), "dtype": str(dtype)}:
+        case {"kind": "Box", "low": list(low), "high": list(high), "shape": list(shape), "dtype": str(dtype)}:
             kind = np.dtype(dtype)
             return spaces.Box(_array(low, shape, kind), _array(high, shape, kind), dtype=kind.type)
         case {"kind": "Dict", "parts": dict(parts)}:

@@ -1,5 +1,6 @@
 """Films of a policy: an mp4 where there is no screen, a window where there is one."""
 
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,17 +19,19 @@ def film(policy: Policy, make: Callable[[str], gymnasium.Env], path: Path | None
     Raises ``UserError`` if the environment cannot be drawn, or the packages that write a film are missing.
     """
     environment = make("human" if path is None else "rgb_array")
-    frames = []
+    frames: list[np.ndarray] = []
     try:
         for episode in range(episodes):
             obs, _ = environment.reset(seed=seed + episode if episode == 0 else None)
             memory, done = None, False
             while not done:
-                frames.append(_frame(environment) if path is not None else None)
+                if path is not None:
+                    frames.append(_frame(environment))
                 action, memory = policy.predict(obs, memory)
                 obs, _, terminated, truncated, _ = environment.step(_plain(environment.action_space, action))
                 done = terminated or truncated
-            frames.append(_frame(environment) if path is not None else None)
+            if path is not None:
+                frames.append(_frame(environment))
         fps = int(environment.metadata.get("render_fps") or _FPS)
     finally:
         environment.close()
@@ -48,15 +51,20 @@ def _frame(environment: gymnasium.Env) -> np.ndarray:
 
 def _write(frames: list[np.ndarray], path: Path, fps: int) -> Path:
     try:
-        import imageio.v2 as imageio
-        import imageio_ffmpeg  # noqa: F401
+        from imageio_ffmpeg import write_frames
     except ImportError:
-        raise UserError("writing a film needs two packages: pip install 'thorndike[video]'") from None
+        raise UserError("writing a film needs a package more: pip install 'thorndike[video]'") from None
     path.parent.mkdir(parents=True, exist_ok=True)
-    # Video blocks are 16 pixels wide; padding beats imageio's rescaling.
+    # Video blocks are 16 pixels wide; repeating the edge beats rescaling.
     height, width = frames[0].shape[:2]
     padding = ((0, -height % 16), (0, -width % 16), (0, 0))
-    with imageio.get_writer(path, fps=fps, codec="libx264", macro_block_size=16) as writer:
+    size = (width + -width % 16, height + -height % 16)
+    with warnings.catch_warnings():
+        # The encoder is a child process, started by fork; it runs no Python, so JAX's threads are in no danger.
+        warnings.filterwarnings("ignore", message="os.fork", category=RuntimeWarning)
+        writer = write_frames(str(path), size, fps=fps, codec="libx264", macro_block_size=16)
+        writer.send(None)
         for frame in frames:
-            writer.append_data(np.pad(frame, padding))
+            writer.send(np.ascontiguousarray(np.pad(frame, padding, mode="edge"), np.uint8))
+        writer.close()
     return path

@@ -1,0 +1,199 @@
+"""What every learner promises: stable types, one trace, safe donation, repeatable bits, exact resume."""
+
+import dataclasses
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from thorndike.algorithms import dqn, ppo, q_learning
+from thorndike.environments import wrappers
+from thorndike.environments.native import factory
+from thorndike.environments.native.vectorize import vectorize
+from thorndike.training.run_directory import checkpoints
+from thorndike.training.runner import Carry, Runner, runner
+from thorndike.training.session import Progressed, restore, save_checkpoint
+from thorndike.training.sources import compiled_source
+from thorndike.types import Algorithm, Source, Wrapper
+
+NUM_ENVS, SEEDS, ITERATIONS = 4, 3, 8
+NORMALISED = (wrappers.normalize_observation(), wrappers.normalize_reward(0.99))
+PPO = ppo.Config(total_steps=1000, n_steps=8, batch_size=16, n_epochs=2, net_arch=(8,), learning_rate="linear(1e-3, 0)")
+DQN = dqn.Config(
+    total_steps=1000,
+    buffer_size=120,
+    learning_starts=40,
+    batch_size=8,
+    train_freq=8,
+    gradient_steps=2,
+    target_update_interval=16,
+    net_arch=(8, 8),
+)
+TABLE = q_learning.Config(total_steps=1000, n_steps=5)
+
+
+class Case(NamedTuple):
+    build: object
+    config: object
+    environment: str
+    wrappers: tuple[Wrapper, ...] = ()
+
+    def make(self) -> tuple[Algorithm, Source]:
+        environment, wrapper = vectorize(factory(self.environment)(), NUM_ENVS), wrappers.chain(*self.wrappers)
+        algorithm = self.build(self.config, wrapper.spec(environment.spec))
+        return algorithm, compiled_source(environment, algorithm, wrapper)
+
+
+def parts(config, **changes):
+    return dataclasses.replace(config, **changes)
+
+
+BINS = (wrappers.discretise(6),)
+RUN = {
+    "ppo": Case(ppo.ppo, PPO, "CartPole-v1", NORMALISED),
+    "dqn": Case(dqn.dqn, parts(DQN, double=True, dueling=True, n_step=3), "CartPole-v1"),
+    "q_learning": Case(q_learning.q_learning, parts(TABLE, variant="sarsa"), "MountainCar-v0", BINS),
+}
+ALL = RUN | {
+    "ppo, Box, KL stop, clipped value": Case(ppo.ppo, parts(PPO, target_kl=0.01, clip_range_vf=0.2), "Pendulum-v1", NORMALISED),
+    "ppo, frames": Case(
+        ppo.ppo, parts(PPO, normalize_advantage=False, clip_range="cosine(0.2, 0.1)"), "Acrobot-v1", (wrappers.frame_stack(3),)
+    ),
+    "dqn, plain": Case(dqn.dqn, parts(DQN, learning_rate="exponential(1e-3, 1e-4)"), "CartPole-v1"),
+    **{
+        f"q_learning, {variant}": Case(q_learning.q_learning, parts(TABLE, variant=variant, visits_power=0.5), "MountainCar-v0", BINS)
+        for variant in ("q_learning", "expected_sarsa", "double_q", "q_lambda")
+    },
+    "q_learning, decay by episodes": Case(q_learning.q_learning, parts(TABLE, exploration_decay=0.99), "MountainCar-v0", BINS),
+}
+
+
+def described(tree) -> tuple:
+    return jax.tree.structure(tree), [(leaf.shape, leaf.dtype, leaf.weak_type) for leaf in jax.tree.leaves(tree)]
+
+
+@pytest.mark.parametrize("case", ALL.values(), ids=ALL)
+def test_types_are_strong_and_stay_as_they_are_over_an_update(case):
+    algorithm, source = case.make()
+
+    def iteration(key, learn):
+        learner, state = algorithm.init(key), source.init(key)
+        after, rollout, episodes = source.collect(state, algorithm.actor(learner), source.draw(key))
+        later, metrics = learn(learner, rollout, key)
+        return (learner, state), (later, after), (metrics, episodes)
+
+    for learn in (algorithm.update, algorithm.observe):
+        before, after, reported = jax.eval_shape(lambda key, learn=learn: iteration(key, learn), jax.random.key(0))
+        assert described(before) == described(after)
+        assert not any(leaf.weak_type for leaf in jax.tree.leaves((after, reported)))
+        assert not any(leaf.dtype.name.endswith("64") for leaf in jax.tree.leaves((after, reported)))
+        assert all(leaf.shape == () for leaf in jax.tree.leaves(reported)), "metrics are reduced inside the program"
+
+
+class Bound(NamedTuple):
+    name: str
+    case: Case
+    runner: Runner
+    source: Source
+    traces: list[str]
+
+
+@pytest.fixture(scope="module", params=RUN)
+def bound(request, quick_compile) -> Bound:
+    case = RUN[request.param]
+    algorithm, source = case.make()
+    traces: list[str] = []
+
+    def counted(state, rollout, key):
+        traces.append("update")
+        return algorithm.update(state, rollout, key)
+
+    many = runner(algorithm._replace(update=counted), source, 3, range(SEEDS), usual_segment=5)
+    return Bound(request.param, case, many, source, traces)
+
+
+def assert_equal(first, second) -> None:
+    for (path, a), b in zip(jax.tree.leaves_with_path(first), jax.tree.leaves(second), strict=True):
+        np.testing.assert_array_equal(a, b, err_msg=jax.tree_util.keystr(path))
+
+
+def advance(bound: Bound, *segments: int, first: int = 0, carry: Carry | None = None) -> tuple[Carry, list]:
+    """The carry after these segments, and their reports."""
+    carry, reports = bound.runner.init() if carry is None else carry, []
+    for count in segments:
+        carry, report = bound.runner.advance(carry, first, count)
+        first += count
+        reports.append(jax.tree.map(np.asarray, report))
+    return carry, reports
+
+
+def test_three_segments_are_one_trace(bound):
+    carry, _ = advance(bound, ITERATIONS)
+    after_first = len(bound.traces)
+    assert after_first > 0
+    advance(bound, 1, 7, 3, first=ITERATIONS, carry=carry)
+    assert len(bound.traces) == after_first
+
+
+def test_the_carry_is_donated_and_no_two_leaves_share_memory(bound):
+    carry = bound.runner.init()
+    for segment in range(2):
+        leaves = [leaf for leaf in jax.tree.leaves(carry) if leaf.size and not jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)]
+        pointers = [leaf.unsafe_buffer_pointer() for leaf in leaves]
+        assert len(set(pointers)) == len(pointers)
+        before = carry
+        carry, _ = bound.runner.advance(carry, segment * ITERATIONS, ITERATIONS)
+        assert all(leaf.is_deleted() for leaf in jax.tree.leaves(before.learner)), "the old learner is not kept beside the new one"
+
+
+def test_metrics_are_finite_and_one_number_a_seed(bound):
+    _, reports = advance(bound, ITERATIONS, ITERATIONS)
+    assert reports[-1].metrics
+    for name, values in reports[-1].metrics.items():
+        assert values.shape == (SEEDS,), name
+        assert np.isfinite(values).all(), name
+    assert (reports[0].episodes.steps == ITERATIONS * bound.runner.steps_per_iteration).all()
+
+
+def test_the_same_seed_twice_is_bit_for_bit_the_same_and_other_seeds_are_not(bound):
+    (first, reports), (second, again) = advance(bound, ITERATIONS), advance(bound, ITERATIONS)
+    assert_equal((first, reports), (second, again))
+    per_seed = [np.concatenate([np.ravel(np.asarray(leaf)[i]) for leaf in jax.tree.leaves(first.learner)]) for i in range(SEEDS)]
+    assert not np.array_equal(per_seed[0], per_seed[1])
+    assert not np.array_equal(per_seed[1], per_seed[2])
+
+
+def test_ten_segments_of_one_are_one_of_ten(bound):
+    """Across the end of a warm-up and of a block of random numbers too."""
+    once, whole = advance(bound, 10)
+    often, parts = advance(bound, *[1] * 10)
+    assert_equal(once, often)
+    assert_equal(whole[0].episodes.steps, sum(part.episodes.steps for part in parts))
+    np.testing.assert_allclose(whole[0].episodes.return_sum, sum(part.episodes.return_sum for part in parts), rtol=1e-5)
+
+
+def test_a_seed_among_others_is_that_seed_alone(bound):
+    """To 1e-5 after four updates: XLA's matrix products over a batch of seeds add up in another order. Tables agree bit for bit."""
+    algorithm, source = bound.case.make()
+    iterations = algorithm.needs.warmup_iterations + 4
+    many, _ = advance(bound, iterations)
+    alone = runner(algorithm, source, 3, [1], usual_segment=5)
+    one, _ = alone.advance(alone.init(), 0, iterations)
+    exact = bound.name == "q_learning"
+    for (path, a), b in zip(jax.tree.leaves_with_path(many), jax.tree.leaves(one), strict=True):
+        tolerance = {"rtol": 0, "atol": 0} if exact else {"rtol": 1e-5, "atol": 1e-5}
+        np.testing.assert_allclose(np.asarray(a)[1], np.asarray(b)[0], **tolerance, err_msg=jax.tree_util.keystr(path))
+
+
+def test_training_saving_loading_and_training_on_is_training_without_a_stop(bound, tmp_path: Path):
+    through, reports = advance(bound, 6, 6)
+    half, _ = advance(bound, 6)
+    save_checkpoint(tmp_path, half, bound.source, Progressed(6, 1.5, 2.5), bound.runner.steps_per_iteration)
+    assert [path.name for path in checkpoints(tmp_path)] == [str(6 * bound.runner.steps_per_iteration)]
+    restored, progressed = restore(tmp_path, bound.runner, bound.source)
+    assert progressed == Progressed(6, 1.5, 2.5)
+    resumed, later = advance(bound, 6, first=6, carry=restored)
+    assert_equal((through, reports[1]), (resumed, later[0]))

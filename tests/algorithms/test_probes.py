@@ -1,0 +1,210 @@
+"""Every learner on every probe environment that it applies to: ten seeds, all ten right.
+
+The probes are one compiled program per learner: the seed axis holds ten seeds of each probe, and an environment that steps all probes
+shows each seed its own.
+"""
+
+from collections.abc import Sequence
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from thorndike.algorithms import dqn, ppo, q_learning
+from thorndike.environments import wrappers
+from thorndike.environments.native import factory
+from thorndike.environments.native.randomness import draw_words
+from thorndike.environments.native.vectorize import vectorize
+from thorndike.environments.probes import PROBES, TIME_LIMIT, Probe
+from thorndike.training.runner import runner
+from thorndike.training.sources import compiled_source
+from thorndike.types import Algorithm, Environment, EnvSpec, Wrapper
+
+SEEDS, NUM_ENVS, GAMMA = 10, 8, 0.9
+TOLERANCE, PROBABILITY = 0.05, 0.95
+SAMPLES = 400
+PLAIN = tuple(probe for probe in PROBES if probe.scale == 1)
+SCALED = tuple(probe for probe in PROBES if probe.scale != 1)
+DISCRETE = tuple(probe for probe in PLAIN if probe.action_values)
+BOX = tuple(probe for probe in PLAIN if not probe.action_values)
+
+
+def several(probes: Sequence[Probe], which: jax.Array | int) -> Environment:
+    """The probe of number ``which``, as one program for all of them: their states are alike, and only one has a limit that is reached."""
+    parts = [factory(probe.id)() for probe in probes]
+
+    def one_of(trees: Sequence, number: jax.Array | int):
+        return jax.tree.map(lambda *leaves: jnp.stack([jnp.broadcast_to(leaf, NUM_ENVS) for leaf in leaves])[number], *trees)
+
+    def shown(number: jax.Array | int) -> Environment:
+        return vectorize(
+            parts[0]._replace(
+                reset=lambda words: one_of([part.reset(words) for part in parts], number),
+                observe=lambda signal: jnp.stack([part.observe(signal) for part in parts])[number],
+                step=lambda signal, action, noise: one_of([part.step(signal, action, noise) for part in parts], number),
+                draw_reset=draw_words,
+                max_episode_steps=TIME_LIMIT,
+            ),
+            NUM_ENVS,
+        )
+
+    def init(key):
+        state, obs = shown(which).init(key)
+        return (jnp.asarray(which, jnp.int32), state), obs
+
+    def step(state, action, noise):
+        after, result = shown(state[0]).step(state[1], action, noise)
+        return (state[0], after), result
+
+    return Environment(init, step, shown(0).draw, shown(0).spec)
+
+
+class Learnt(NamedTuple):
+    """What the seeds of all probes ended with, ``[probes, seeds, ...]``."""
+
+    probes: tuple[Probe, ...]
+    actors: object
+    statistics: object
+    algorithm: Algorithm
+    wrapper: Wrapper
+
+    def values(self, number: int) -> np.ndarray:
+        """``[seeds, observations]``."""
+        return np.asarray(self._of_each_seed(number, lambda actor, seen: self.algorithm.value(actor, seen)))
+
+    def actions(self, number: int) -> np.ndarray:
+        """``[seeds, samples, observations]`` as the policy draws them; of one that explores by epsilon, without that."""
+
+        def chosen(actor, seen):
+            noise = jax.tree.map(lambda leaf: leaf[:, : seen.shape[0]], self.algorithm.draw(jax.random.key(7), SAMPLES))
+            choose = self.algorithm.greedy if hasattr(actor, "epsilon") else self.algorithm.act
+            return jax.vmap(lambda drawn: choose(actor, (), seen, drawn)[1])(noise)
+
+        return np.asarray(self._of_each_seed(number, chosen))
+
+    def _of_each_seed(self, number: int, function):
+        obs = jnp.array(self.probes[number].observations)[:, None]
+
+        def one(actor, statistics):
+            return function(actor, self.wrapper.init(statistics, obs)[1])
+
+        return jax.vmap(one)(*jax.tree.map(lambda leaf: leaf[number * SEEDS : (number + 1) * SEEDS], (self.actors, self.statistics)))
+
+
+def learn(probes: tuple[Probe, ...], build, iterations: int, wrapper: Wrapper | None = None) -> Learnt:
+    """Train ten seeds on each of ``probes``, which have one kind of action, in one program."""
+    wrapper = wrappers.chain() if wrapper is None else wrapper
+    algorithm = build(wrapper.spec(several(probes, 0).spec))
+    which = jnp.repeat(jnp.arange(len(probes)), SEEDS)
+    bound = runner(algorithm, compiled_source(several(probes, 0), algorithm, wrapper), 0, range(len(which)), usual_segment=iterations)
+
+    def begin(number, key):
+        return compiled_source(several(probes, number), algorithm, wrapper).init(key)
+
+    carry = bound.init()._replace(source=jax.jit(jax.vmap(begin))(which, jax.random.split(jax.random.key(1), len(which))))
+    carry, _ = bound.advance(carry, 0, iterations)
+    return Learnt(probes, jax.vmap(algorithm.actor)(carry.learner), carry.source.statistics, algorithm, wrapper)
+
+
+def check_values(learnt: Learnt, number: int) -> None:
+    probe = learnt.probes[number]
+    wrong = np.abs(learnt.values(number) - np.array(probe.values)).max(axis=1)
+    assert (wrong <= TOLERANCE * probe.scale).all(), f"{probe.id} catches a mistake in {probe.catches}: V is wrong by {wrong.round(3)}"
+
+
+def check_actions(learnt: Learnt, number: int) -> None:
+    """The best action has 0.95 of the probability; of a Box, the actions whose reward is within 0.05 of the best one's."""
+    probe = learnt.probes[number]
+    actions, best = learnt.actions(number), np.array(probe.actions)
+    right = actions == best if probe.action_values else np.square(actions[..., 0] - best) <= TOLERANCE
+    probability = right.mean(axis=1).min(axis=1)
+    assert (probability >= PROBABILITY).all(), f"{probe.id} catches a mistake in {probe.catches}: P(best) is {probability.round(3)}"
+
+
+def ppo_for(iterations: int, spec: EnvSpec, **settings) -> Algorithm:
+    config = {"n_steps": 20, "batch_size": 80, "n_epochs": 4, "gamma": GAMMA, "learning_rate": "linear(0.01, 0)", "net_arch": (16,)}
+    return ppo.ppo(ppo.Config(total_steps=iterations * 20 * NUM_ENVS, **(config | settings)), spec)
+
+
+def dqn_for(iterations: int, spec: EnvSpec, **parts) -> Algorithm:
+    config = dqn.Config(
+        **parts,
+        total_steps=iterations * NUM_ENVS,
+        learning_rate="linear(0.005, 0)",
+        buffer_size=4000,
+        learning_starts=200,
+        train_freq=NUM_ENVS,
+        gradient_steps=2,
+        batch_size=32,
+        target_update_interval=10 * NUM_ENVS,
+        gamma=GAMMA,
+        exploration_final_eps=0.2,
+        net_arch=(16,),
+    )
+    return dqn.dqn(config, spec)
+
+
+def table_for(iterations: int, variant: str, spec: EnvSpec) -> Algorithm:
+    config = q_learning.Config(
+        total_steps=iterations * 8 * NUM_ENVS,
+        variant=variant,
+        learning_rate="linear(0.3, 0.01)",
+        gamma=GAMMA,
+        n_steps=8,
+        exploration_final_eps=0.0,
+        exploration_fraction=1.0,
+    )
+    return q_learning.q_learning(config, spec)
+
+
+def normalising() -> Wrapper:
+    return wrappers.chain(wrappers.normalize_observation(), wrappers.normalize_reward(GAMMA))
+
+
+CASES = {
+    "ppo": lambda: learn(DISCRETE, partial(ppo_for, 60), 60),
+    "ppo, Box": lambda: learn(BOX, partial(ppo_for, 60, log_std_init=-2.0), 60),
+    "dqn": lambda: learn(DISCRETE, partial(dqn_for, 1200), 1200),
+    "q_learning": lambda: learn(DISCRETE, partial(table_for, 60, "q_learning"), 60, wrappers.discretise(3)),
+}
+SLOW_CASES = {
+    "dqn, double, dueling, 3 steps": lambda: learn(DISCRETE, partial(dqn_for, 1200, double=True, dueling=True, n_step=3), 1200),
+    "sarsa": lambda: learn(DISCRETE, partial(table_for, 100, "sarsa"), 100, wrappers.discretise(3)),
+    "expected sarsa": lambda: learn(DISCRETE, partial(table_for, 100, "expected_sarsa"), 100, wrappers.discretise(3)),
+    "double q": lambda: learn(DISCRETE, partial(table_for, 100, "double_q"), 100, wrappers.discretise(3)),
+    "q(lambda)": lambda: learn(DISCRETE, partial(table_for, 100, "q_lambda"), 100, wrappers.discretise(3)),
+}
+
+
+def with_slow(cases: dict, slow: dict) -> list:
+    return [
+        *(pytest.param(make, id=name) for name, make in cases.items()),
+        *(pytest.param(make, id=name, marks=pytest.mark.slow) for name, make in slow.items()),
+    ]
+
+
+@pytest.mark.parametrize("train", with_slow(CASES, SLOW_CASES))
+def test_every_seed_ends_with_the_right_values_and_actions(train, quick_compile):
+    learnt = train()
+    for number, probe in enumerate(learnt.probes):
+        check_values(learnt, number)
+        if probe.actions:
+            check_actions(learnt, number)
+
+
+SCALED_CASES = {"ppo": lambda: learn(SCALED[::2], partial(ppo_for, 60), 60, normalising())}
+SLOW_SCALED_CASES = {
+    "ppo, Box": lambda: learn(SCALED[1::2], partial(ppo_for, 60, log_std_init=-2.0), 60, normalising()),
+    "dqn": lambda: learn(SCALED[::2], partial(dqn_for, 1200), 1200, normalising()),
+}
+
+
+@pytest.mark.parametrize("train", with_slow(SCALED_CASES, SLOW_SCALED_CASES))
+def test_normalisation_makes_up_for_the_size_of_rewards_and_an_offset_of_observations(train, quick_compile):
+    """Values are of normalised rewards, whose unit moves while learning, so actions alone are right or wrong."""
+    learnt = train()
+    for number in range(len(learnt.probes)):
+        check_actions(learnt, number)

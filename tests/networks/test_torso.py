@@ -1,0 +1,150 @@
+"""From observations of every space to features: order, shapes, images, initial weights."""
+
+from collections import OrderedDict
+
+import gymnasium.spaces as spaces
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from thorndike.errors import UserError
+from thorndike.networks.torso import CNN, MLP, Torso, flatten_observation, is_image, torch_uniform
+from thorndike.training.space_files import space_from_json, space_to_json
+
+BATCH = 3
+
+
+def batch_of(space: spaces.Space, seed: int = 0) -> tuple:
+    """Samples, and the same stacked as arrays of the dtypes a learner sees."""
+    space.seed(seed)
+    drawn = [space.sample() for _ in range(BATCH)]
+
+    def array(*leaves):
+        stacked = np.stack(leaves)
+        if stacked.dtype.kind == "f":
+            return jnp.asarray(stacked, jnp.float32)
+        return jnp.asarray(stacked, stacked.dtype if stacked.dtype == np.uint8 else jnp.int32)
+
+    return drawn, jax.tree.map(array, *drawn)
+
+
+FLAT = [
+    spaces.Box(-1, 1, (4,)),
+    spaces.Box(-1, 1, ()),
+    spaces.Box(-1, 1, (2, 3), np.float64),
+    spaces.Discrete(5),
+    spaces.Discrete(3, start=-1),
+    spaces.MultiBinary(4),
+    spaces.MultiBinary([2, 2]),
+    spaces.MultiDiscrete([2, 3, 4]),
+    spaces.MultiDiscrete([2, 3], start=[5, -2]),
+    spaces.MultiDiscrete([[2, 3], [4, 2]]),
+]
+
+
+@pytest.mark.parametrize("space", FLAT, ids=str)
+def test_a_plain_space_is_flattened_as_gymnasium_does(space):
+    drawn, obs = batch_of(space)
+    found = flatten_observation(space, obs)
+    expected = [spaces.flatten(space, one) for one in drawn]
+    assert found.dtype == jnp.float32
+    np.testing.assert_allclose(found, np.asarray(expected, np.float32).reshape(BATCH, -1), rtol=1e-6)
+
+
+NESTED = spaces.Dict(
+    {
+        "z": spaces.Discrete(2),
+        "a": spaces.Tuple([spaces.Box(-1, 1, (2,)), spaces.Dict({"inner": spaces.MultiDiscrete([2, 2])})]),
+        "picture": spaces.Box(0, 255, (2, 2, 1), np.uint8),
+    }
+)
+
+
+def test_nested_parts_lie_side_by_side_in_the_order_of_their_names():
+    drawn, obs = batch_of(NESTED)
+    found = flatten_observation(NESTED, obs)
+    assert found.shape == (BATCH, 2 + 4 + 4 + 2)
+    for row, one in zip(np.asarray(found), drawn, strict=True):
+        inner = np.eye(2)[one["a"][1]["inner"]].ravel()
+        expected = np.concatenate([one["a"][0], inner, one["picture"].ravel(), np.eye(2)[one["z"]]])
+        np.testing.assert_allclose(row, expected)
+
+
+def test_the_order_does_not_depend_on_how_the_dict_space_was_written():
+    """A policy's space comes back from JSON with its names sorted: the features must not move."""
+    written = spaces.Dict(OrderedDict([("b", spaces.Box(-1, 1, (2,))), ("a", spaces.Discrete(3))]))
+    _, obs = batch_of(written)
+    reread = space_from_json(space_to_json(written))
+    np.testing.assert_array_equal(flatten_observation(written, obs), flatten_observation(reread, obs))
+
+
+def test_leading_axes_are_kept():
+    obs = jnp.arange(24.0).reshape(2, 3, 4)
+    np.testing.assert_array_equal(flatten_observation(spaces.Box(0, 24, (4,)), obs), obs)
+    assert flatten_observation(spaces.Discrete(3), jnp.zeros((2, 5), jnp.int32)).shape == (2, 5, 3)
+
+
+def test_an_unknown_space_is_refused():
+    with pytest.raises(UserError, match="observations may be Box"):
+        flatten_observation(spaces.Text(5), jnp.zeros((1, 5)))
+
+
+@pytest.mark.parametrize(
+    ("space", "image"),
+    [
+        (spaces.Box(0, 255, (84, 84), np.uint8), True),
+        (spaces.Box(0, 255, (84, 84, 4), np.uint8), True),
+        (spaces.Box(0, 1, (10, 10, 4)), True),
+        (spaces.Box(0, 1, (10, 10)), False),
+        (spaces.Box(0, 255, (84,), np.uint8), False),
+        (NESTED, False),
+    ],
+)
+def test_images_are_told_from_rows(space, image):
+    assert is_image(space) is image
+
+
+@pytest.mark.parametrize(
+    ("size", "kernels"),
+    [
+        ((84, 84, 4), [(8, 8, 4, 32), (4, 4, 32, 64), (3, 3, 64, 64), (7 * 7 * 64, 128)]),
+        ((36, 36, 1), [(8, 8, 1, 32), (4, 4, 32, 64), (3, 3, 64, 64), (64, 128)]),
+        ((10, 10, 4), [(3, 3, 4, 16), (8 * 8 * 16, 128)]),
+    ],
+)
+def test_large_images_get_the_nature_network_and_small_ones_one_layer(size, kernels):
+    module, image = CNN(128, jax.nn.initializers.orthogonal()), jax.ShapeDtypeStruct((2, *size), jnp.float32)
+    features, variables = jax.eval_shape(lambda key, x: module.init_with_output(key, x), jax.random.key(0), image)
+    assert features.shape == (2, 128)
+    assert sorted(layer["kernel"].shape for layer in variables["params"].values()) == sorted(kernels)
+
+
+def test_pixels_are_scaled_to_1_and_a_grey_image_gets_a_channel():
+    space = spaces.Box(0, 255, (6, 6), np.uint8)
+    torso = Torso(space, (8,), "relu", torch_uniform)
+    grey = jnp.asarray(np.random.default_rng(0).integers(0, 256, (2, 6, 6)), jnp.uint8)
+    found, variables = torso.init_with_output(jax.random.key(0), grey)
+    assert variables["params"]["CNN_0"]["Conv_0"]["kernel"].shape == (3, 3, 1, 16)
+    # The same picture as floats in [0, 1], through the space of floats.
+    floats = Torso(spaces.Box(0, 1, (6, 6, 1)), (8,), "relu", torch_uniform)
+    np.testing.assert_allclose(floats.apply(variables, grey[..., None] / 255.0), found, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("fan_in", [3, 100])
+def test_torch_uniform_fills_plus_minus_one_over_the_root_of_fan_in(fan_in):
+    weights = np.asarray(torch_uniform(jax.random.key(0), (fan_in, 2000)))
+    bound = fan_in**-0.5
+    assert abs(weights).max() <= bound
+    assert abs(weights).max() > 0.99 * bound
+    np.testing.assert_allclose(weights.std(), bound / 3**0.5, rtol=0.03)
+
+
+def test_a_perceptron_activates_every_layer_but_its_outputs():
+    module, x = MLP((8, 8), "relu", torch_uniform, outputs=3), jax.random.normal(jax.random.key(1), (BATCH, 5))
+    params = module.init(jax.random.key(0), x)["params"]
+    expected = x
+    for name in ("Dense_0", "Dense_1"):
+        expected = np.maximum(expected @ params[name]["kernel"] + params[name]["bias"][None], 0)
+    expected = expected @ params["Dense_2"]["kernel"] + params["Dense_2"]["bias"][None]
+    np.testing.assert_allclose(module.apply({"params": params}, x), expected, rtol=1e-4, atol=1e-5)
