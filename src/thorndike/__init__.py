@@ -21,8 +21,6 @@ _PUBLIC = {
     "evaluate": "thorndike.api",
     "UserError": "thorndike.errors",
     "Network": "thorndike.networks.network",
-    "functional": "thorndike.functional",
-    "networks": "thorndike.networks",
     "planning": "thorndike.algorithms.planning",
     "wrappers": "thorndike.environments.wrappers",
 }

@@ -149,7 +149,7 @@ class Wrapper(NamedTuple):
 
     name: str
     settings: dict
-    """What ``policy.json`` records so that the wrapper can be rebuilt; empty if it does not touch observations."""
+    """What ``run.json`` and ``policy.json`` record so that the wrapper can be rebuilt; empty if it holds a function of the user's."""
     spec: Callable[[EnvSpec], EnvSpec]
     statistics: Callable[[EnvSpec], PyTree]
     """wrapped spec -> initial statistics, ``()`` if none."""
@@ -166,8 +166,8 @@ class Source(NamedTuple):
 
     init: Callable[[Key[Array, ""]], PyTree]
     """key -> source state. Consumes the key."""
-    draw: Callable[[Key[Array, ""]], Noise]
-    """key -> all random numbers of one iteration. Consumes the key."""
+    draw: Callable[[Key[Array, ""], int], Noise]
+    """key, number of iterations -> their random numbers, leading with the iteration. Consumes the key."""
     collect: Callable[[PyTree, PyTree, Noise], tuple[PyTree, Rollout, EpisodeStats]]
     """source state, Actor, noise of one iteration -> source state, rollout ``[T, B, ...]``, episode statistics."""
     statistics: Callable[[PyTree], PyTree]

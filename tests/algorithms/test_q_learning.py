@@ -180,10 +180,11 @@ def test_epsilon_falls_linearly_over_its_part_of_the_run():
 def test_the_greedy_policy_takes_the_best_action_and_the_value_is_its_own():
     space = Tuple((Discrete(2), Discrete(2)))
     algorithm = q_learning(settings("q_learning"), SPEC._replace(observation_space=space, action_space=Discrete(2, start=3)))
+    # Learners count actions from 0; the engine adds the space's start.
     actor = algorithm.actor(algorithm.init(jax.random.key(0)))._replace(q=jnp.array([[0.0, 1], [2, 0], [3, 0], [0, 4]]))
     obs = (jnp.array([0, 1], jnp.int32), jnp.array([1, 1], jnp.int32))
     noise = jax.tree.map(lambda x: x[0], algorithm.draw(jax.random.key(0), 1))
-    np.testing.assert_array_equal(algorithm.greedy(actor, (), obs, noise)[1], [3, 4])
+    np.testing.assert_array_equal(algorithm.greedy(actor, (), obs, noise)[1], [0, 1])
     np.testing.assert_array_equal(algorithm.value(actor, obs), [2.0, 4.0])
 
 

@@ -8,6 +8,7 @@ from gymnasium import spaces
 from thorndike.environments.native import factory
 from thorndike.environments.native.vectorize import vectorize
 from thorndike.environments.wrappers import (
+    centre_reward,
     chain,
     discretise,
     exported,
@@ -339,7 +340,7 @@ def test_an_exported_chain_is_rebuilt_and_shows_the_same():
     memory, rollout = act_through(wrapper, statistics, observations, np.ones((10, 4), bool))
     statistics, memory, _ = wrapper.learn(statistics, memory, rollout)
     part = exported(wrapper, statistics)
-    assert [settings["name"] for settings in part.settings] == ["normalize_observation", "frame_stack"]
+    assert [settings["name"] for settings in part.settings] == ["normalize_reward", "normalize_observation", "frame_stack"]
     rebuilt = from_settings(part.settings)
     assert jax.tree.structure(rebuilt.statistics(spec)) == jax.tree.structure(part.statistics)
     memory, shown = wrapper.init(statistics, observations[0])
@@ -392,3 +393,13 @@ def test_a_wrapped_native_environment_is_one_that_scans():
 def test_a_wrapper_that_learns_cannot_be_built_into_an_environment():
     with pytest.raises(UserError, match="normalize_reward learns"):
         wrap(vectorize(factory("CartPole-v1")(), 1), normalize_reward(0.9))
+
+
+def test_centre_reward_adds_the_nearness_to_zero_of_each_dimension_of_the_successor() -> None:
+    wrapper = centre_reward(0.1, [0, 2], [2.0, 0.5])
+    next_obs = jnp.array([[1.0, 9.0, 0.25, 9.0], [0.0, 9.0, 0.5, 9.0]], jnp.float32)
+    no = jnp.zeros(2, bool)
+    step = Step(next_obs, next_obs, jnp.ones(2), jnp.zeros(2), no, no, jnp.array([True, False]))
+    _, shaped = wrapper.step((), (), next_obs, jnp.zeros(2, jnp.int32), step)
+    np.testing.assert_allclose(shaped.reward, [1.0 + 0.1 * (0.5 + 0.5), 1.0], rtol=1e-6)
+    assert from_settings([wrapper.settings]).name == "centre_reward"

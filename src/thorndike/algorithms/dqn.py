@@ -122,7 +122,7 @@ def dqn(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) ->
     learning_rate = schedule(config.learning_rate)
     final, fraction = config.exploration_final_eps, min(config.exploration_fraction, 1.0)
     exploration = schedule(f"linear({config.exploration_initial_eps}, {final}, {fraction})")
-    example = jax.tree.map(lambda x: jnp.zeros((1, *x.shape), x.dtype), spec.observation_space.sample())
+    example = jax.tree.map(lambda x: jnp.zeros((1, *x.shape), jnp.asarray(x).dtype), spec.observation_space.sample())
     # Parameters travel as one flat vector: optimiser, target and gradient are then a few kernels, not a few a layer.
     template = jax.eval_shape(net.init, jax.random.key(0), example)
     _, unravel = ravel_pytree(jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), template))

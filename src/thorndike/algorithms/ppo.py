@@ -161,7 +161,7 @@ def ppo(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) ->
         net = network(spec, distribution.network_outputs + distribution.free_parameters)
     optimizer = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam(eps=1e-5))
     learning_rate, clip_range = schedule(config.learning_rate), schedule(config.clip_range)
-    example = jax.tree.map(lambda x: jnp.zeros((1, *x.shape), x.dtype), spec.observation_space.sample())
+    example = jax.tree.map(lambda x: jnp.zeros((1, *x.shape), jnp.asarray(x).dtype), spec.observation_space.sample())
 
     def init(key: Key[Array, ""]) -> State:
         params = net.init(key, example)

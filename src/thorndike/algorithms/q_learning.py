@@ -42,7 +42,7 @@ class Config:
     total_steps: Annotated[int, Between(1, 2**31 - 1)]  # environment steps of the whole run, against which schedules are measured
     variant: Literal["q_learning", "sarsa", "expected_sarsa", "double_q", "q_lambda"] = "q_learning"  # which target is learnt
     gamma: Annotated[float, Between(0, 1)] = 0.99  # discount (gamma)
-    learning_rate: Annotated[float | str, Between(0, 1)] = 0.1  # step size (alpha)
+    learning_rate: Annotated[float | str, Between(0, 1)] = 0.1  # step size (alpha), or a schedule such as linear(0.1, 0.001)
     visits_power: Annotated[float, Between(0, 1)] = 0.0  # the step size is divided by visits(s, a) ** this; 0: not at all
     trace_decay: Annotated[float, Between(0, 1)] = 0.9  # decay of eligibility traces (lambda), for q_lambda
     exploration_initial_eps: Annotated[float, Between(0, 1)] = 1.0  # chance of a random action at the start (epsilon)
@@ -123,7 +123,7 @@ def q_learning(config: Config, spec: EnvSpec) -> Algorithm:
     """Build the learner. Raises UserError for continuous observations or actions, or a table of more than 2**28 entries."""
     if not isinstance(spec.action_space, Discrete):
         raise UserError(f"q_learning needs Discrete actions, but {spec.id} has {spec.action_space}; ppo takes those")
-    (states, number), actions, first_action = state_index(spec.observation_space), int(spec.action_space.n), int(spec.action_space.start)
+    (states, number), actions = state_index(spec.observation_space), int(spec.action_space.n)
     if states * actions > 2**28:
         raise UserError(f"q_learning would need a table of {states} states x {actions} actions for {spec.id}: use fewer bins, or dqn")
     learn, rate = row_by_row(_learner(config, (states, actions, spec.num_envs))), schedule(config.learning_rate)
@@ -150,22 +150,21 @@ def q_learning(config: Config, spec: EnvSpec) -> Algorithm:
 
     def act(actor: Actor, memory: PyTree, obs: PyTree, noise: Draws) -> tuple[PyTree, Int[Array, "*batch"], Extras]:
         choice = epsilon_greedy(values(actor, obs), actor.epsilon, noise[0], random_ties=config.random_ties)
-        return memory, choice.action + first_action, Extras(choice.greedy, noise[1])
+        return memory, choice.action, Extras(choice.greedy, noise[1])
 
     def greedy(actor: Actor, memory: PyTree, obs: PyTree, noise: Draws) -> tuple[PyTree, Int[Array, "*batch"], Extras]:
         action = values(actor, obs).argmax(axis=-1).astype(jnp.int32)
-        return memory, action + first_action, Extras(jnp.ones_like(action, bool), noise[1])
+        return memory, action, Extras(jnp.ones_like(action, bool), noise[1])
 
     def update(state: State, rollout: Rollout, key: Key[Array, ""]) -> tuple[State, Metrics]:
-        step, action, pending = rollout.step, rollout.action.astype(jnp.int32) - first_action, state.pending
+        step, action, pending = rollout.step, rollout.action.astype(jnp.int32), state.pending
         transition = Transition(number(rollout.obs), action, step.reward, number(step.next_obs), step.terminated, step.done, step.valid)
         if sarsa:
             delayed = jax.tree.map(lambda old, new: jnp.concatenate([old[None], new[:-1]]), pending, transition)
             transition, pending = delayed, jax.tree.map(lambda new: new[-1], transition)
         epsilon, alpha = _epsilon(config, state.epsilon, progress(state)), rate(progress(state))
-        each = partial(jnp.broadcast_to, shape=transition.state.shape)
-        env, extras = jnp.arange(spec.num_envs, dtype=jnp.int32), rollout.extras
-        rows = Row(each(env), transition, action, extras.greedy, extras.coin, each(epsilon), each(alpha))
+        each, extras = partial(jnp.broadcast_to, shape=transition.state.shape), rollout.extras
+        rows = Row(each(jnp.arange(spec.num_envs)), transition, action, extras.greedy, extras.coin, each(epsilon), each(alpha))
         tables, errors = learn(state.tables, jax.tree.map(jnp.ravel, rows))
         decay = 1.0 if config.exploration_decay is None else config.exploration_decay
         fallen = jnp.maximum(state.epsilon * jnp.where(step.done & step.valid, decay, 1.0).prod(), config.exploration_final_eps)

@@ -15,7 +15,7 @@ from thorndike.errors import UserError
 from thorndike.networks.network import NetworkBuilder
 from thorndike.networks.torso import is_image
 from thorndike.suggestions import did_you_mean
-from thorndike.training.host_source import HostSource, host_source
+from thorndike.training.host_source import HostEngine, HostSource, host_source
 from thorndike.training.presets import Preset
 from thorndike.training.runner import Runner, runner
 from thorndike.training.session import Plan
@@ -67,6 +67,21 @@ class Job(NamedTuple):
     runner: Runner
     plan: Plan
     close: Callable[[], None]
+
+
+def make(
+    environment: EnvironmentLike,
+    num_envs: int = 1,
+    *,
+    engine: str = "auto",
+    env_kwargs: Mapping[str, object] | None = None,
+    max_episode_steps: int | None = None,
+) -> Environment | HostEngine:
+    """The environments a run would train on: pure functions of a compiled engine, or a host engine to step from Python."""
+    choice = registry.resolve(environment, engine=engine, env_kwargs=env_kwargs, max_episode_steps=max_episode_steps)
+    if choice.engine == "native":
+        return registry.build_native(choice, num_envs)
+    return registry.build_host(choice, num_envs)
 
 
 def check_algorithm(algorithm: str) -> None:
@@ -148,7 +163,7 @@ def build_job(request: Request, choice: registry.Choice, given: Sequence[Wrapper
         spec, close = engine.spec._replace(num_envs=request.num_envs), engine.close
         algorithm, plan = _learner(request, spec, wrapper, network)
         source = host_source(engine, algorithm, wrapper, request.seed, indices, plan.checkpoint_every)
-    bound = runner(algorithm, source, request.seed, indices, plan.log_every)
+    bound = runner(algorithm, source, request.seed, indices)
     return Job(request, algorithm, wrapper, spec, source, bound, plan, close)
 
 

@@ -98,6 +98,11 @@ def load(run: str | Path, *, environment: EnvironmentLike | None = None, network
     return LoadedPolicy(policy, facts, environment)
 
 
+def evaluate_run(run: str | Path, episodes: int = 100, seed: int = 0, deterministic: bool = True) -> Evaluation:
+    """Evaluate every seed of a run on fresh reference environments: ``load(run).evaluate(...)``."""
+    return load(run).evaluate(episodes, seed, deterministic=deterministic)
+
+
 def _shapes(algorithm: Algorithm, wrapper: Wrapper, spec: EnvSpec, seeds: int) -> dict:
     def one(key: jax.Array) -> dict:
         return {"actor": algorithm.actor(algorithm.init(key)), "statistics": wrapper.statistics(spec)}

@@ -154,11 +154,11 @@ def _need_objects(
 ) -> None:
     """Raises ``UserError`` if something that was a Python object is not given again, or there is nothing to go on from."""
     if record["network"] == "user" and network is None:
-        raise UserError(f"{run} was trained with a network of your own: pass it again as network=...")
+        raise UserError(f"{run} was trained with a network of your own; go on in Python: td.resume(run, network=...)")
     if record["environment_object"] and environment is None:
-        raise UserError(f"{run} was trained on an environment object: pass it again as environment=...")
+        raise UserError(f"{run} was trained on an environment object; go on with it in Python: td.resume(run, environment=...)")
     if wrappers is None and not all(record["wrappers"]):
-        raise UserError(f"{run} was trained with wrappers that hold functions of your own: pass them all again as wrappers=[...]")
+        raise UserError(f"{run} was trained with wrappers that hold your own functions; go on in Python: td.resume(run, wrappers=[...])")
     if not any(intact(folder) for folder in checkpoints(run)):
         raise UserError(f"{run} has no intact checkpoint to go on from; train again, or lower --checkpoint-every")
 

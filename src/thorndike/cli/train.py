@@ -71,7 +71,7 @@ def run(words: Sequence[str]) -> Answer:
 def add_training_arguments(parser: Parser, fields: Mapping[str, FieldFacts]) -> None:
     """The arguments that say what is trained; `train` and `bench` share them."""
     parser.add_argument("algorithm", nargs="?", metavar="ALGORITHM", help=f"one of {', '.join(ALGORITHMS)}")
-    parser.add_argument("environment", nargs="?", metavar="ENVIRONMENT", help="a Gymnasium id, or module:Id")
+    parser.add_argument("environment", nargs="?", metavar="ENVIRONMENT", help="a Gymnasium id, module:Id, or path/to/file.py:ClassName")
     _add_old_hands_flags(parser)
     parser.add_argument("--steps", type=positive_whole, help="environment steps of each seed: 50000, 50k, 1e6")
     parser.add_argument("--seeds", type=positive_whole, default=1, help="independent agents trained at once (default: 1)")

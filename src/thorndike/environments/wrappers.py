@@ -145,7 +145,8 @@ def normalize_reward(gamma: float, epsilon: float = 1e-8, clip: float = 10.0) ->
         statistics = merge_moments(statistics, moments_of(returns, rows.valid))
         return statistics, memory, rollout._replace(step=rows._replace(reward=scale(rows.reward, statistics, epsilon, clip)))
 
-    return Wrapper("normalize_reward", {}, _same_spec, lambda env_spec: empty_moments(()), init, step, learn)
+    settings = {"name": "normalize_reward", "gamma": gamma, "epsilon": epsilon, "clip": clip}
+    return Wrapper("normalize_reward", settings, _same_spec, lambda env_spec: empty_moments(()), init, step, learn)
 
 
 def frame_stack(k: int) -> Wrapper:
@@ -184,6 +185,25 @@ def shape_reward(function: Callable[[Observation, Action, Step], Batch]) -> Wrap
         return memory, step._replace(reward=jnp.where(step.valid, function(obs, action, step), 0.0))
 
     return Wrapper("shape_reward", {}, _same_spec, _no_statistics, _init_nothing, step, learn_nothing)
+
+
+def centre_reward(weight: float, dimensions: Sequence[int], limits: Sequence[float]) -> Wrapper:
+    """The reward plus ``weight * sum_d (1 - |s'_d| / limit_d)`` over dimensions of a Box: a bonus for being near 0 in each.
+
+    Tutorials of tabular CartPole shape the reward by the angle and the position in this way. Raises UserError if `dimensions` and
+    `limits` differ in number.
+    """
+    if len(dimensions) != len(limits):
+        raise UserError(f"centre_reward needs one limit for each dimension, not {len(limits)} for {len(dimensions)}")
+    places, scale = np.array(dimensions), np.array(limits, np.float32)
+
+    def step(statistics: PyTree, memory: PyTree, obs: Observation, action: Action, step: Step) -> tuple[PyTree, Step]:
+        del statistics, obs, action
+        bonus = weight * jnp.sum(1.0 - jnp.abs(step.next_obs[..., places]) / scale, axis=-1)
+        return memory, step._replace(reward=step.reward + jnp.where(step.valid, bonus, 0.0))
+
+    settings = {"name": "centre_reward", "weight": weight, "dimensions": list(dimensions), "limits": list(limits)}
+    return Wrapper("centre_reward", settings, _same_spec, _no_statistics, _init_nothing, step, learn_nothing)
 
 
 def potential_shaping(potential: Callable[[Observation], Batch], gamma: float) -> Wrapper:
@@ -245,7 +265,7 @@ def chain(*wrappers: Wrapper) -> Wrapper:
 
 
 def exported(wrapper: Wrapper, statistics: PyTree) -> Exported:
-    """What a policy needs of a wrapper: the parts that touch observations. ``from_settings(settings)`` is used with ``statistics``."""
+    """What a policy keeps of a wrapper: the parts that hold no function. ``from_settings(settings)`` is used with ``statistics``."""
     settings = wrapper.settings
     parts, own = (settings["parts"], statistics) if settings.get("name") == "chain" else ([settings], (statistics,))
     kept = [(part, one) for part, one in zip(parts, own, strict=True) if part]
@@ -300,6 +320,7 @@ def _of_view(
 
 def _from_one(part: dict) -> Wrapper:
     builders: dict[str, Callable[..., Wrapper]] = {
+        "centre_reward": centre_reward,
         "discretise": discretise,
         "normalize_observation": normalize_observation,
         "normalize_reward": normalize_reward,

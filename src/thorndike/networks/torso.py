@@ -74,6 +74,11 @@ class Torso(nn.Module):
         return CNN(self.hidden[-1] if self.hidden else 128, self.kernel_init)(scaled)
 
 
+def example_observation(space: gymnasium.Space) -> Observation:
+    """Zeros shaped as a batch of one observation, in the dtypes that reach a network."""
+    return jax.tree.map(lambda x: jnp.zeros((1, *np.shape(x)), jax.dtypes.canonicalize_dtype(np.asarray(x).dtype)), space.sample())
+
+
 def is_image(space: gymnasium.Space) -> bool:
     """Whether observations are images: a Box of uint8 ``[H, W]`` or ``[H, W, C]``, or of floats with a small channel axis."""
     if not isinstance(space, gymnasium.spaces.Box):

@@ -57,9 +57,11 @@ def picture(grid: Grid | None, values: Float[np.ndarray, " states"], policy: Int
 
 
 def save_picture(grid: Grid, values: Float[np.ndarray, " states"], policy: Int[np.ndarray, " states"], path: Path) -> Path:
-    """Draw values as colours and greedy actions as arrows into an image file, and return its path. Needs the extra `plot` (matplotlib)."""
-    from matplotlib.figure import Figure
-
+    """Draw values as colours and greedy actions as arrows into an image file, and return its path. Raises UserError without Matplotlib."""
+    try:
+        from matplotlib.figure import Figure
+    except ModuleNotFoundError:
+        raise UserError("drawing needs Matplotlib: pip install 'thorndike[plot]'") from None
     marks, table = _marks(grid, values, policy), values.reshape(len(grid.letters), -1)
     rows, columns = table.shape
     figure = Figure(figsize=(1.0 + columns * 0.9, 0.6 + rows * 0.9), layout="constrained")

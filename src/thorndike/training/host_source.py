@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Key, PyTree
 
 from thorndike.training.acting import Acting, acting
+from thorndike.training.sources import by_iteration
 from thorndike.types import Algorithm, EnvSpec, EpisodeStats, Noise, Observation, Rollout, Source, Step, Wrapper
 
 
@@ -144,7 +145,7 @@ def host_source(
 
     source = Source(
         init=init,
-        draw=lambda key: algorithm.draw(key, length),
+        draw=lambda key, iterations: by_iteration(algorithm.draw(key, iterations * length), iterations),
         collect=collect,
         statistics=lambda state: state.statistics,
         spec=wrapper.spec(spec),

@@ -63,8 +63,8 @@ class Policy:
         self._draws += 1
         noise = self.noise(jax.random.fold_in(jax.random.key(0), self._draws), jax.tree.leaves(batch)[0].shape[0])
         inner, action = self._decide[deterministic](actor, inner, seen, noise)
-        chosen = jax.tree.map(lambda x: np.asarray(x)[0] if single else np.asarray(x), action)
-        return chosen, (inner, wrapper_memory, batch)
+        chosen = _from_start(self.spec.action_space, np.asarray(action))
+        return chosen[0] if single else chosen, (inner, wrapper_memory, batch)
 
     def value(self, obs: Observation) -> np.ndarray:
         """The learner's estimate of the value of one observation, or of each in a batch."""
@@ -111,18 +111,30 @@ class Policy:
         return (jax.tree.map(lambda x: x[None], cast) if single else cast), single
 
 
+def _from_start(space: gymnasium.Space, action: np.ndarray) -> np.ndarray:
+    """Learners count whole-number actions from 0; within the library the engines add the space's start, here there is none."""
+    if isinstance(space, gymnasium.spaces.Discrete | gymnasium.spaces.MultiDiscrete):
+        return action + np.asarray(space.start, action.dtype)
+    return action
+
+
 def _batch_axes(space: gymnasium.Space, obs: Observation) -> int:
     """0 for one observation, 1 for a batch. Raises ``UserError`` for anything else."""
     if isinstance(space, gymnasium.spaces.Dict):
         _require(isinstance(obs, dict) and set(obs) == set(space.spaces), space, obs)
-        return max(_batch_axes(part, obs[name]) for name, part in space.spaces.items())
+        return _same_axes(space, obs, {_batch_axes(part, obs[name]) for name, part in space.spaces.items()})
     if isinstance(space, gymnasium.spaces.Tuple):
         _require(isinstance(obs, tuple | list) and len(obs) == len(space.spaces), space, obs)
-        return max(_batch_axes(part, obs[i]) for i, part in enumerate(space.spaces))
+        return _same_axes(space, obs, {_batch_axes(part, obs[i]) for i, part in enumerate(space.spaces)})
     shape = space.shape or ()
     axes = np.ndim(obs) - len(shape)
     _require(axes in (0, 1) and np.shape(obs)[axes:] == shape, space, obs)
     return axes
+
+
+def _same_axes(space: gymnasium.Space, obs: Observation, axes: set[int]) -> int:
+    _require(len(axes) <= 1, space, obs)
+    return max(axes, default=0)
 
 
 def _require(holds: bool, space: gymnasium.Space, obs: Observation) -> None:

@@ -57,6 +57,11 @@ def to_environment(space: gymnasium.Space, action: Action) -> Action:
     return low + (jnp.clip(action, -1.0, 1.0) + 1.0) * (0.5 * (high - low))
 
 
+def by_iteration(noise: Noise, iterations: int) -> Noise:
+    """Noise ``[iterations * T, ...]`` as ``[iterations, T, ...]``."""
+    return jax.tree.map(lambda x: x.reshape((iterations, -1, *x.shape[1:])), noise)
+
+
 def where_done(done: Array, chosen: PyTree, otherwise: PyTree) -> PyTree:
     """``where`` over leaves ``[B, ...]`` by a flag ``[B]``."""
 
@@ -80,9 +85,10 @@ def compiled_source(environment: Environment, algorithm: Algorithm, wrapper: Wra
             state, obs, seen, algorithm.memory(spec.num_envs), wrapper_memory, statistics, zeros, jnp.zeros((spec.num_envs,), jnp.int32)
         )
 
-    def draw(key: Key[Array, ""]) -> Noise:
+    def draw(key: Key[Array, ""], iterations: int) -> Noise:
         key_act, key_environment = jax.random.split(key)
-        return algorithm.draw(key_act, length), environment.draw(key_environment, length)
+        flat = algorithm.draw(key_act, iterations * length), environment.draw(key_environment, iterations * length)
+        return by_iteration(flat, iterations)
 
     def one_step(state: SourceState, actor: PyTree, noise: Noise) -> tuple[SourceState, Emitted]:
         noise_act, noise_environment = noise

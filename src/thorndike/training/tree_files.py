@@ -13,7 +13,7 @@ from thorndike.errors import UserError
 
 def save_tree(tree: PyTree, path: Path) -> None:
     """Write every array of ``tree`` under its path; typed PRNG keys as their raw words."""
-    save_file({name: np.ascontiguousarray(_plain(leaf)) for name, leaf in _named(tree)}, path)
+    save_file({name: np.asarray(_plain(leaf), order="C") for name, leaf in _named(tree)}, path)
 
 
 def load_tree(like: PyTree, path: Path) -> PyTree:
