@@ -7,6 +7,11 @@
 
 import importlib
 
+from thorndike import startup
+
+# Environment variables only, in a millisecond: JAX reads them when it is imported, which the first use of anything below does.
+startup.prepare()
+
 _PUBLIC = {
     "train": "thorndike.api",
     "resume": "thorndike.api",

@@ -99,7 +99,7 @@ def learn(probes: tuple[Probe, ...], build, iterations: int, wrapper: Wrapper | 
     wrapper = wrappers.chain() if wrapper is None else wrapper
     algorithm = build(wrapper.spec(several(probes, 0).spec))
     which = jnp.repeat(jnp.arange(len(probes)), SEEDS)
-    bound = runner(algorithm, compiled_source(several(probes, 0), algorithm, wrapper), 0, range(len(which)), usual_segment=iterations)
+    bound = runner(algorithm, compiled_source(several(probes, 0), algorithm, wrapper), 0, range(len(which)))
 
     def begin(number, key):
         return compiled_source(several(probes, number), algorithm, wrapper).init(key)
@@ -137,7 +137,7 @@ def dqn_for(iterations: int, spec: EnvSpec, **parts) -> Algorithm:
         buffer_size=4000,
         learning_starts=200,
         train_freq=NUM_ENVS,
-        gradient_steps=2,
+        gradient_steps=4,
         batch_size=32,
         target_update_interval=10 * NUM_ENVS,
         gamma=GAMMA,

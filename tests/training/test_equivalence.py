@@ -106,7 +106,7 @@ def targets_of(engine, length: int) -> list[np.ndarray]:
     algorithm = ppo.ppo(config, engine.spec)
     source = host_source(engine, algorithm, wrappers.chain(), 0, [0], reseed_every=10**6).source
     params = jax.vmap(algorithm.init)(jax.random.split(jax.random.key(3), 1)).params
-    noise = jax.vmap(source.draw)(jax.random.split(jax.random.key(4), 1))
+    noise = jax.vmap(lambda key: jax.tree.map(lambda x: x[0], source.draw(key, 1)))(jax.random.split(jax.random.key(4), 1))
     _, rollout, episodes = source.collect(source.init(jax.random.split(jax.random.key(5), 1)), params, noise)
     network = actor_critic(engine.spec.observation_space, 2, 0, config.net_arch, config.activation)
     one = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), (rollout, params))

@@ -13,6 +13,7 @@ Logs ``train/loss``, ``policy_gradient_loss``, ``value_loss``, ``entropy_loss``,
 ``learning_rate``, ``clip_range``, ``std`` (Box). Results and their commands: docs/algorithms/ppo.md.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
@@ -20,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import optax
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, Int, Key, PyTree
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from thorndike.errors import UserError
 from thorndike.functional.action_distributions import ActionDistribution, action_distribution
@@ -35,7 +36,7 @@ from thorndike.functional.policy_losses import (
 )
 from thorndike.functional.returns import generalized_advantage
 from thorndike.functional.schedules import schedule
-from thorndike.functional.shuffling import shuffled
+from thorndike.functional.shuffling import minibatches
 from thorndike.networks.heads import actor_critic
 from thorndike.networks.network import Network, NetworkBuilder
 from thorndike.networks.torso import ACTIVATIONS
@@ -138,6 +139,33 @@ def prepare(rollout: Rollout, params: PyTree, network: Network, config: Config) 
     return jax.tree.map(as_rows, batch)
 
 
+def improve(
+    flat: Float[Array, " P"],
+    opt_state: PyTree,
+    batch: Minibatch,
+    order: Int[Array, "minibatches M"],
+    gradient: Callable[[Float[Array, " P"], Minibatch], tuple[tuple[Array, Metrics], Float[Array, " P"]]],
+    optimizer: optax.GradientTransformation,
+    rate: Float[Array, ""],
+    target_kl: float | None,
+) -> tuple[Float[Array, " P"], PyTree, Bool[Array, ""], Metrics]:
+    """One optimiser step a minibatch: parameters, optimiser, whether the KL stayed in bounds, metrics of every minibatch."""
+
+    def step(carry: tuple[Array, PyTree, Array], indices: Int[Array, " M"]) -> tuple[tuple[Array, PyTree, Array], Metrics]:
+        flat, opt_state, going = carry
+        (_, metrics), grads = gradient(flat, jax.tree.map(lambda x: x[indices], batch))
+        direction, new_opt_state = optimizer.update(grads, opt_state)
+        metrics["train/grad_norm"] = jnp.linalg.norm(grads)
+        if target_kl is None:
+            return (flat - rate * direction, new_opt_state, going), metrics
+        going = going & (metrics["train/approx_kl"] <= 1.5 * target_kl)
+        new_opt_state = jax.tree.map(lambda new, old: jnp.where(going, new, old), new_opt_state, opt_state)
+        return (jnp.where(going, flat - rate * direction, flat), new_opt_state, going), metrics
+
+    (flat, opt_state, going), metrics = jax.lax.scan(step, (flat, opt_state, jnp.array(True)), order)
+    return flat, opt_state, going, metrics
+
+
 def ppo(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) -> Algorithm:
     """PPO for an environment. Raises ``UserError`` where a rollout does not divide into minibatches or the space is not supported."""
     rows = config.n_steps * spec.num_envs
@@ -183,19 +211,8 @@ def ppo(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) ->
         flat, unravel = ravel_pytree(state.params)
         gradient = jax.value_and_grad(lambda v, rows: ppo_loss(unravel(v), rows, net, distribution, config, clip), has_aux=True)
 
-        def learn(carry: tuple[Array, PyTree, Array], rows: Minibatch) -> tuple[tuple[Array, PyTree, Array], Metrics]:
-            flat, opt_state, going = carry
-            (_, metrics), grads = gradient(flat, rows)
-            direction, new_opt_state = optimizer.update(grads, opt_state)
-            metrics["train/grad_norm"] = jnp.linalg.norm(grads)
-            if config.target_kl is None:
-                return (flat - rate * direction, new_opt_state, going), metrics
-            going = going & (metrics["train/approx_kl"] <= 1.5 * config.target_kl)
-            new_opt_state = jax.tree.map(lambda new, old: jnp.where(going, new, old), new_opt_state, opt_state)
-            return (jnp.where(going, flat - rate * direction, flat), new_opt_state, going), metrics
-
-        minibatches = shuffled(key, batch, config.n_epochs, batch_size)
-        (flat, opt_state, going), metrics = jax.lax.scan(learn, (flat, state.opt_state, jnp.array(True)), minibatches)
+        order = minibatches(key, rows, config.n_epochs, batch_size)
+        flat, opt_state, going, metrics = improve(flat, state.opt_state, batch, order, gradient, optimizer, rate, config.target_kl)
         metrics = jax.tree.map(jnp.mean, metrics)
         metrics["train/explained_variance"] = explained_variance(batch.value, batch.target, batch.weight > 0)
         metrics["train/learning_rate"], metrics["train/clip_range"] = rate, clip

@@ -199,7 +199,8 @@ def centre_reward(weight: float, dimensions: Sequence[int], limits: Sequence[flo
 
     def step(statistics: PyTree, memory: PyTree, obs: Observation, action: Action, step: Step) -> tuple[PyTree, Step]:
         del statistics, obs, action
-        bonus = weight * jnp.sum(1.0 - jnp.abs(step.next_obs[..., places]) / scale, axis=-1)
+        off_centre = jnp.abs(step.next_obs[..., places])
+        bonus = weight * jnp.sum(1.0 - off_centre / jnp.broadcast_to(scale, off_centre.shape), axis=-1)
         return memory, step._replace(reward=step.reward + jnp.where(step.valid, bonus, 0.0))
 
     settings = {"name": "centre_reward", "weight": weight, "dimensions": list(dimensions), "limits": list(limits)}

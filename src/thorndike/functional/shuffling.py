@@ -4,7 +4,7 @@ import math
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int, Key, PyTree
+from jaxtyping import Array, Int, Key
 
 
 def permutation(key: Key[Array, ""], n: int) -> Int[Array, " n"]:
@@ -21,8 +21,10 @@ def permutation(key: Key[Array, ""], n: int) -> Int[Array, " n"]:
     return (jnp.sort(words) & mask).astype(jnp.int32)
 
 
-def shuffled(key: Key[Array, ""], rows: PyTree, epochs: int, batch_size: int) -> PyTree:
-    """Minibatches ``[epochs * n / batch_size, batch_size, ...]`` of rows ``[n, ...]``, in a new order each epoch. Consumes the key."""
-    n = jax.tree.leaves(rows)[0].shape[0]
-    order = jax.vmap(lambda k: permutation(k, n))(jax.random.split(key, epochs)).reshape(-1, batch_size)
-    return jax.tree.map(lambda x: x[order], rows)
+def minibatches(key: Key[Array, ""], n: int, epochs: int, batch_size: int) -> Int[Array, "minibatches {batch_size}"]:
+    """Row numbers of the minibatches of several passes over ``n`` rows, in a new order each pass. Consumes the key.
+
+    The rows themselves are gathered where a minibatch is used: a copy of every pass would hold a rollout of images ten times.
+    """
+    order = jax.vmap(lambda k: permutation(k, n))(jax.random.split(key, epochs))
+    return order.reshape(-1, batch_size)
