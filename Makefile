@@ -55,7 +55,15 @@ test: $(STAMP)
 test-slow: $(STAMP)
 	@$(BIN)/pytest -q -m slow
 
-bench: $(STAMP)
+# PyTorch's CPU build where there is one, else what the registry has: the peers run on the CPU either way.
+.venv-peers/.installed: benchmarks/peers.txt
+	$(PYTHON) -m venv .venv-peers
+	.venv-peers/bin/python -m pip install --quiet torch==2.13.0+cpu || .venv-peers/bin/python -m pip install --quiet torch==2.13.0
+	grep -v '^torch==' benchmarks/peers.txt > .venv-peers/peers.txt
+	.venv-peers/bin/python -m pip install --quiet -r .venv-peers/peers.txt
+	@touch $@
+
+bench: $(STAMP) .venv-peers/.installed
 	@$(BIN)/python benchmarks/run.py
 
 format: $(STAMP)
