@@ -171,10 +171,10 @@ def test_a_resumed_host_run_is_the_run_that_was_never_stopped(tmp_path):
     with (stopped.run / "metrics.jsonl").open("a") as file:
         file.write('{"steps": 1')  # what a killed process leaves behind
     resumed = resume(stopped.run, environment=Corridor)
-    assert (resumed.status, resumed.steps, resumed.seeds) == ("finished", 320, 2)
+    assert (resumed.status, resumed.steps, resumed.seeds) == ("finished", 384, 2), "a run ends at a checkpoint"
     assert logged(resumed.run) == logged(whole.run)
     assert policy_bytes(resumed.run) == policy_bytes(whole.run)
-    assert [path.name for path in sorted((resumed.run / "checkpoints").iterdir())] == ["288", "320"]
+    assert [path.name for path in sorted((resumed.run / "checkpoints").iterdir())] == ["288", "384"]
 
 
 def test_a_resumed_compiled_run_is_the_run_that_was_never_stopped(tmp_path, monkeypatch):

@@ -180,7 +180,14 @@ def is_large(request_algorithm: str, choice: registry.Choice) -> bool:
 def _learner(request: Request, spec: EnvSpec, wrapper: Wrapper, network: NetworkBuilder | None) -> tuple[Algorithm, Plan]:
     algorithm = build_algorithm(request.algorithm, request.config, wrapper.spec(spec), network)
     per_iteration = algorithm.needs.rollout_length * request.num_envs
-    return algorithm, Plan(*(max(1, math.ceil(n / per_iteration)) for n in (request.steps, request.log_every, request.checkpoint_every)))
+    plan = Plan(*(max(1, math.ceil(n / per_iteration)) for n in (request.steps, request.log_every, request.checkpoint_every)))
+    if algorithm.needs.warmup_iterations >= plan.iterations:
+        warmup = algorithm.needs.warmup_iterations * per_iteration
+        raise UserError(f"{request.algorithm}: the first {warmup} steps only fill the memory, so {request.steps} steps would learn nothing")
+    if request.engine != "native":
+        # Host environments start afresh at checkpoints; a run ends at one, so that a longer run passes through the same states.
+        plan = plan._replace(iterations=math.ceil(plan.iterations / plan.checkpoint_every) * plan.checkpoint_every)
+    return algorithm, plan
 
 
 def _nothing() -> None:

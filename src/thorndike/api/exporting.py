@@ -3,6 +3,7 @@
 import json
 import math
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
 import jax
@@ -19,8 +20,8 @@ from thorndike.training.tree_files import save_tree
 POLICY_FORMAT = 1
 
 
-def export_policy(run: Path, record: dict[str, object], job: Job, carry: Carry, point: LogPoint | None) -> None:
-    """Write ``policy/`` aside and rename it into place. The best seed is the one with the highest return at ``point``."""
+def export_policy(run: Path, record: dict[str, object], job: Job, carry: Carry, points: Sequence[LogPoint]) -> None:
+    """Write ``policy/`` aside and rename it into place. The best seed is the one with the highest return over ``points``."""
     source = job.source.source if isinstance(job.source, HostSource) else job.source
     shown = exported(job.wrapper, source.statistics(carry.source))
     actors = jax.vmap(job.algorithm.actor)(carry.learner)
@@ -40,7 +41,7 @@ def export_policy(run: Path, record: dict[str, object], job: Job, carry: Carry, 
             "observation_space": space_to_json(job.spec.observation_space),
             "action_space": space_to_json(job.spec.action_space),
             "seeds": job.request.seeds,
-            "best": _best(point, job.request.seeds),
+            "best": _best(points, job.request.seeds),
         },
     )
 
@@ -56,8 +57,8 @@ def write_policy(run: Path, arrays: dict, content: dict[str, object]) -> None:
     publish(aside, run / "policy")
 
 
-def _best(point: LogPoint | None, seeds: int) -> int:
-    if point is None:
-        return 0
-    returns = [-math.inf if value is None else value for value in point.values["rollout/ep_rew_mean"]]
-    return max(range(seeds), key=returns.__getitem__)
+def _best(points: Sequence[LogPoint], seeds: int) -> int:
+    """The seed with the highest mean training return over the points; one that ended no episode there is never the best."""
+    returns = [[point.values["rollout/ep_rew_mean"][seed] for point in points] for seed in range(seeds)]
+    means = [[value for value in values if value is not None] for values in returns]
+    return max(range(seeds), key=lambda seed: sum(means[seed]) / len(means[seed]) if means[seed] else -math.inf)

@@ -5,12 +5,14 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
+import gymnasium
 import jax
 import jax.numpy as jnp
 
 from thorndike.api.building import EnvironmentLike, build_algorithm
 from thorndike.environments import registry
 from thorndike.environments.host.gymnasium_engine import LoopEngine
+from thorndike.environments.origins import limit_of
 from thorndike.environments.wrappers import from_settings
 from thorndike.errors import UserError
 from thorndike.training.evaluation import Evaluation, evaluate
@@ -20,6 +22,9 @@ from thorndike.training.space_files import space_from_json
 from thorndike.training.tree_files import load_tree
 from thorndike.training.video import film
 from thorndike.types import Algorithm, EnvSpec, Wrapper
+
+LONGEST_EPISODE = 10_000
+"""Steps after which evaluation cuts an episode of an environment that has no time limit of its own."""
 
 
 class LoadedPolicy:
@@ -44,11 +49,15 @@ class LoadedPolicy:
         return [LoadedPolicy(policy, self.facts, self._environment) for policy in self._policy.seeds]
 
     def evaluate(self, episodes: int = 100, seed: int = 0, num_envs: int | None = None, deterministic: bool = True) -> Evaluation:
-        """Run every seed on fresh reference environments; the episodes are appended to the run's evaluations.jsonl."""
+        """Run every seed on fresh reference environments; the episodes are appended to the run's evaluations.jsonl.
+
+        An environment without a time limit gets one of ``LONGEST_EPISODE`` steps.
+        """
         choice = self._choice()
+        limit = choice.max_episode_steps
 
         def build(number: int) -> LoopEngine:
-            return LoopEngine([partial(registry.reference, choice)] * number, choice.id, choice.max_episode_steps)
+            return LoopEngine([partial(registry.reference, choice)] * number, choice.id, limit)
 
         found = evaluate(self._policy, build, episodes, seed, num_envs or 20, deterministic)
         if self.run is not None:
@@ -67,7 +76,14 @@ class LoadedPolicy:
         if self._environment is None and self.facts["environment_object"]:
             raise UserError(f"{self.run} was trained on an environment object: load it with td.load(run, environment=...)")
         named: EnvironmentLike = self.facts["environment"] if self._environment is None else self._environment
-        return registry.resolve(named, env_kwargs=self.facts["env_kwargs"], max_episode_steps=self.facts["max_episode_steps"])
+        choice = registry.resolve(named, env_kwargs=self.facts["env_kwargs"], max_episode_steps=self.facts["max_episode_steps"])
+        if choice.max_episode_steps is not None or isinstance(choice.origin, gymnasium.vector.VectorEnv):
+            return choice
+        probe = registry.reference(choice)
+        limit = limit_of(probe)
+        probe.close()
+        # A greedy policy that walks in circles would never end an episode of an environment without a limit.
+        return choice if limit is not None else choice._replace(max_episode_steps=LONGEST_EPISODE)
 
 
 def load(run: str | Path, *, environment: EnvironmentLike | None = None, network: Callable | None = None) -> LoadedPolicy:
@@ -78,6 +94,9 @@ def load(run: str | Path, *, environment: EnvironmentLike | None = None, network
     """
     run = Path(run)
     folder = run / "policy"
+    if not folder.is_dir() and (run / "policy.old").is_dir():
+        # A process killed between the two renames of an export leaves the policy before it there.
+        folder = run / "policy.old"
     if not folder.is_dir():
         raise UserError(
             f"{run} has no trained policy: {'it has not reached its first checkpoint' if run.is_dir() else 'no such directory'}"

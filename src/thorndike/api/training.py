@@ -52,6 +52,8 @@ def train(
     network of your own. Raises ``UserError`` for anything that cannot be.
     """
     check_algorithm(algorithm)
+    if not 0 <= seed < 2**32 or seeds < 1:
+        raise UserError(f"a seed is a number from 0 to 2^32 - 1, and there is at least one; got seed={seed}, seeds={seeds}")
     choice = registry.resolve(environment, engine=engine, env_kwargs=env_kwargs, max_episode_steps=max_episode_steps)
     if algorithm == "planning":
         return plan_run(choice, settings or {}, output, name, command)
@@ -109,8 +111,8 @@ def _conduct(run: Path, record: dict[str, object], job: Job, progress: bool, fre
     write_json(run / "run.json", record)
     wall_began, cpu_began = time.perf_counter(), time.process_time()
 
-    def export(carry: Carry, point: LogPoint | None) -> None:
-        export_policy(run, record, job, carry, point)
+    def export(carry: Carry, points: Sequence[LogPoint]) -> None:
+        export_policy(run, record, job, carry, points)
 
     try:
         carry, start = (job.runner.init(), START) if fresh else restore(run, job.runner, job.source)
@@ -120,7 +122,8 @@ def _conduct(run: Path, record: dict[str, object], job: Job, progress: bool, fre
             )
             outcome = run_session(run, job.runner, job.source, job.plan, carry, before, export, bar)
     except BaseException as error:
-        write_json(run / "run.json", {**record, "status": "failed", "error": f"{type(error).__name__}: {error}"})
+        status = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
+        write_json(run / "run.json", {**record, "status": status, "error": f"{type(error).__name__}: {error}"})
         raise
     finally:
         job.close()
@@ -134,7 +137,7 @@ def _result(run: Path, job: Job, start: Progressed, outcome: Outcome) -> Result:
     compile_s = job.runner.compile_seconds()
     made = (outcome.steps - start.iteration * job.runner.steps_per_iteration) * job.request.seeds
     wall, cpu = outcome.wall_s - start.wall_s, outcome.cpu_s - start.cpu_s
-    returns = outcome.recent.returns if outcome.recent else []
+    returns = outcome.recent[-1].returns if outcome.recent else []
     return Result(
         run=run,
         status=outcome.status,

@@ -101,8 +101,9 @@ def _from_name(name: str, env_kwargs: Settings, max_episode_steps: int | None, r
     try:
         # Without the checker that looks at every step: it is for writing environments, not for training in them.
         return gymnasium.make(id, max_episode_steps=max_episode_steps, disable_env_checker=True, **settings)
-    except (gymnasium.error.Error, TypeError, ImportError) as error:
-        raise UserError(f"Gymnasium cannot make {name}: {_one_line(error)}") from error
+    except Exception as error:
+        # Whatever an environment's constructor raises is about what was asked of it.
+        raise UserError(f"Gymnasium cannot make {name}: {type(error).__name__}: {_one_line(error)}") from error
 
 
 def _called(make: Callable[..., gymnasium.Env], env_kwargs: Settings, render_mode: str | None, name: str) -> gymnasium.Env:
@@ -111,9 +112,11 @@ def _called(make: Callable[..., gymnasium.Env], env_kwargs: Settings, render_mod
         settings["render_mode"] = render_mode
     try:
         environment = make(**settings)
-    except TypeError as error:
+    except Exception as error:
         hint = "; give it a render_mode argument, as Gymnasium's environments have, to watch it" if render_mode is not None else ""
-        raise UserError(f"{name} cannot be made with {settings or 'no settings'}: {_one_line(error)}{hint}") from error
+        raise UserError(
+            f"{name} cannot be made with {settings or 'no settings'}: {type(error).__name__}: {_one_line(error)}{hint}"
+        ) from error
     if not isinstance(environment, gymnasium.Env):
         raise UserError(f"{name} must give a gymnasium.Env, not {type(environment).__name__}")
     return environment
@@ -155,7 +158,11 @@ def _load(path: Path) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     # Registered so that the class can be pickled and copied.
     sys.modules[name] = module
-    spec.loader.exec_module(module)
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        del sys.modules[name]
+        raise UserError(f"{path} cannot be imported: {type(error).__name__}: {_one_line(error)}") from error
     return module
 
 

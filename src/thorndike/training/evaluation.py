@@ -57,7 +57,7 @@ def evaluate(
         rows = _play(policy, Pool(engine, seeds, num_envs), episodes // num_envs, seed, deterministic)
     finally:
         engine.close()
-    found = summary(np.array([[row.total for row in rows if row.seed == i] for i in range(seeds)]))
+    found = summary(np.array([[row.total for row in rows if row.seed == policy.first + i] for i in range(seeds)]))
     return Evaluation(
         policy.run, engine.spec.id, episodes, found.mean, found.iqm, found.min, found.ci95, tuple(found.per_seed), tuple(rows)
     )
@@ -68,7 +68,7 @@ def _play(policy: Policy, pool: Pool, each: int, seed: int, deterministic: bool)
     seeds, num_envs = pool.seeds, pool.num_envs
     moves = acting(policy.algorithm, policy.wrapper, policy.spec.action_space, seeds, num_envs, greedy=deterministic)
     noise_of = jax.jit(lambda t: _noise(policy, seed, t, seeds, num_envs))
-    obs = pool.reset(environment_seeds(seed, range(seeds), num_envs, _EVALUATION))
+    obs = pool.reset(environment_seeds(seed, range(policy.first, policy.first + seeds), num_envs, _EVALUATION))
     wrapper_memory, seen = moves.first_sight(policy.statistics, obs)
     memory, noise, t = moves.fresh_memory(), noise_of(np.int32(0)), 0
     total, age = np.zeros((seeds, num_envs)), np.zeros((seeds, num_envs), np.int64)
@@ -82,7 +82,7 @@ def _play(policy: Policy, pool: Pool, each: int, seed: int, deterministic: bool)
         for s, e in np.argwhere(raw.done & raw.valid):
             if played[s, e] < each:
                 number = int(e * each + played[s, e])
-                rows.append(Episode(int(s), number, float(total[s, e]), int(age[s, e]), bool(raw.terminated[s, e])))
+                rows.append(Episode(policy.first + int(s), number, float(total[s, e]), int(age[s, e]), bool(raw.terminated[s, e])))
             played[s, e] += 1
             total[s, e], age[s, e] = 0.0, 0
         wrapper_memory, step = moves.see(policy.statistics, wrapper_memory, obs, decision.engine_action, raw)

@@ -19,9 +19,18 @@ class Policy:
     """A policy to act with, evaluate and watch. With several seeds it acts as the best one; ``policy.seeds[i]`` is any other."""
 
     def __init__(
-        self, algorithm: Algorithm, wrapper: Wrapper, spec: EnvSpec, actors: PyTree, statistics: PyTree, best: int, run: Path | None = None
+        self,
+        algorithm: Algorithm,
+        wrapper: Wrapper,
+        spec: EnvSpec,
+        actors: PyTree,
+        statistics: PyTree,
+        best: int,
+        run: Path | None = None,
+        first: int = 0,
     ) -> None:
-        """``actors`` and ``statistics`` lead with the seed axis ``[S]``; ``best`` is the seed used by default."""
+        """``actors`` and ``statistics`` lead with the seed axis ``[S]``; ``best`` is the seed used by default,
+        ``first`` the number of the first one in its run."""
         self.algorithm = algorithm
         self.wrapper = wrapper
         self.spec = spec
@@ -29,6 +38,7 @@ class Policy:
         self.statistics = statistics
         self.best = best
         self.run = run
+        self.first = first
         self._draws = 0
 
     @property
@@ -43,7 +53,7 @@ class Policy:
 
     def _only(self, seed: int) -> "Policy":
         actors, statistics = jax.tree.map(lambda x: x[seed : seed + 1], (self.actors, self.statistics))
-        return Policy(self.algorithm, self.wrapper, self.spec, actors, statistics, 0, self.run)
+        return Policy(self.algorithm, self.wrapper, self.spec, actors, statistics, 0, self.run, self.first + seed)
 
     def predict(self, obs: Observation, memory: PyTree = None, deterministic: bool = True) -> tuple[np.ndarray, PyTree]:
         """Action for one observation, or for a batch of them, and the memory to pass with the next ones.

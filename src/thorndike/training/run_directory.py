@@ -113,9 +113,24 @@ def publish(aside: Path, final: Path) -> None:
     for path in aside.iterdir():
         with path.open("rb") as file:
             os.fsync(file.fileno())
+    old = final.with_name(final.name + ".old")
+    if old.exists():
+        shutil.rmtree(old)
     if final.exists():
-        shutil.rmtree(final)
+        final.rename(old)
     aside.rename(final)
+    flush_folder(final.parent)
+    if old.exists():
+        shutil.rmtree(old)
+
+
+def flush_folder(folder: Path) -> None:
+    """Make renames in a folder durable."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def facts() -> dict[str, object]:

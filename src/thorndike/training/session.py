@@ -4,7 +4,8 @@ import json
 import shutil
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
@@ -20,6 +21,8 @@ from thorndike.training.run_directory import checkpoints, intact, publish, trunc
 from thorndike.training.runner import Carry, Report, Runner
 from thorndike.training.tree_files import load_tree, save_tree
 
+_RECENT = 10
+"""Log points over which the best seed is chosen: a tenth of a run."""
 _KEPT = 2
 """Checkpoints kept: the newest, and one before it should the newest be lost."""
 
@@ -49,8 +52,8 @@ class Outcome(NamedTuple):
     steps: int
     wall_s: float
     cpu_s: float
-    recent: LogPoint | None
-    """The last log point in which episodes ended."""
+    recent: Sequence[LogPoint]
+    """The last log points in which episodes ended."""
 
 
 START = Progressed(0, 0.0, 0.0)
@@ -63,42 +66,45 @@ def run_session(
     plan: Plan,
     carry: Carry,
     progressed: Progressed,
-    export: Callable[[Carry, LogPoint | None], None],
+    export: Callable[[Carry, Sequence[LogPoint]], None],
     bar: Progress,
 ) -> Outcome:
     """Train to the end of ``plan``, or to an interruption. Metrics are fetched one segment late, so that the device never waits."""
     log = MetricsLog(run, progressed.wall_s, progressed.cpu_s)
     iteration = progressed.iteration
     waiting: tuple[Report, int] | None = None
-    recent: LogPoint | None = None
+    recent: deque[LogPoint] = deque(maxlen=_RECENT)
 
-    def settle(waiting: tuple[Report, int] | None) -> LogPoint | None:
+    def settle(waiting: tuple[Report, int] | None) -> None:
         if waiting is None:
-            return recent
+            return
         point = log.write(*waiting)
+        _check_finite(point)
         seeds = len(point.values["rollout/episodes"])
         returns = point.returns
         interval = None if len(returns) < 2 else _interval(returns)
         bar.update(waiting[1], float(np.mean(returns)) if returns else None, interval, seeds * waiting[1] / max(log.wall_s, 1e-9))
-        return point if returns else recent
+        if returns:
+            recent.append(point)
 
     with _stop_on_signals() as stopped:
         while iteration < plan.iterations and not stopped():
             until = min(_next(iteration, plan.log_every), _next(iteration, plan.checkpoint_every), plan.iterations)
             carry, report = runner.advance(carry, iteration, until - iteration)
-            recent = settle(waiting)
+            settle(waiting)
             waiting, iteration = (report, until * runner.steps_per_iteration), until
             if iteration % plan.checkpoint_every == 0 or iteration == plan.iterations:
-                recent, waiting = settle(waiting), None
+                settle(waiting)
+                waiting = None
                 save_checkpoint(run, carry, source, Progressed(iteration, log.wall_s, log.cpu_s), runner.steps_per_iteration)
-                export(carry, recent)
-        recent = settle(waiting)
+                export(carry, tuple(recent))
+        settle(waiting)
     log.close()
     status = "finished" if iteration >= plan.iterations else "interrupted"
     if status == "interrupted" and not isinstance(source, HostSource) and iteration > 0:
         save_checkpoint(run, carry, source, Progressed(iteration, log.wall_s, log.cpu_s), runner.steps_per_iteration)
-        export(carry, recent)
-    return Outcome(status, carry, iteration * runner.steps_per_iteration, log.wall_s, log.cpu_s, recent)
+        export(carry, tuple(recent))
+    return Outcome(status, carry, iteration * runner.steps_per_iteration, log.wall_s, log.cpu_s, tuple(recent))
 
 
 def save_checkpoint(run: Path, carry: Carry, source: PyTree, progressed: Progressed, steps_per_iteration: int) -> None:
@@ -137,6 +143,16 @@ def restore(run: Path, runner: Runner, source: PyTree) -> tuple[Carry, Progresse
 
 def _restorable(carry: Carry, source: PyTree) -> tuple[PyTree, PyTree]:
     return carry.learner, carry.source.statistics if isinstance(source, HostSource) else carry.source
+
+
+def _check_finite(point: LogPoint) -> None:
+    """Raises ``UserError`` for a learner whose numbers are no longer finite: nothing is saved over the last good checkpoint."""
+    for name, values in point.values.items():
+        if name.startswith("train/") and None in values:
+            raise UserError(
+                f"{name} of seed {values.index(None)} is not finite by step {point.steps}: training stopped, the last checkpoint is kept; "
+                "lower learning_rate, or normalise rewards and observations"
+            )
 
 
 def _next(iteration: int, every: int) -> int:
