@@ -21,7 +21,7 @@ from thorndike.training.run_directory import append_lines, intact
 from thorndike.training.space_files import space_from_json
 from thorndike.training.tree_files import load_tree
 from thorndike.training.video import film
-from thorndike.types import Algorithm, EnvSpec, Wrapper
+from thorndike.types import Algorithm, Environment, EnvSpec, Wrapper
 
 LONGEST_EPISODE = 10_000
 """Steps after which evaluation cuts an episode of an environment that has no time limit of its own."""
@@ -77,7 +77,7 @@ class LoadedPolicy:
             raise UserError(f"{self.run} was trained on an environment object: load it with td.load(run, environment=...)")
         named: EnvironmentLike = self.facts["environment"] if self._environment is None else self._environment
         choice = registry.resolve(named, env_kwargs=self.facts["env_kwargs"], max_episode_steps=self.facts["max_episode_steps"])
-        if choice.max_episode_steps is not None or isinstance(choice.origin, gymnasium.vector.VectorEnv):
+        if choice.max_episode_steps is not None or isinstance(choice.origin, gymnasium.vector.VectorEnv | Environment):
             return choice
         probe = registry.reference(choice)
         limit = limit_of(probe)
