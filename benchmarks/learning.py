@@ -61,6 +61,8 @@ def measure(bar: Bar, output: Path = ROOT / "runs") -> dict:
 def record(bar: Bar, run: Path) -> dict:
     """Evaluate a run and describe what was found, and whether the bar holds."""
     facts = json.loads((run / "run.json").read_text())
+    if facts["status"] != "finished":
+        raise SystemExit(f"{run} is {facts['status']}, not finished: there is no result to write down")
     found = td.load(run).evaluate(bar.episodes, seed=0)
     by_seed = [[row.total for row in found.rows if row.seed == seed] for seed in range(facts["seeds"])]
     value = getattr(found, bar.statistic)
