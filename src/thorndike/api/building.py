@@ -17,7 +17,7 @@ from thorndike.networks.torso import is_image
 from thorndike.suggestions import did_you_mean
 from thorndike.training.host_source import HostEngine, HostSource, host_source
 from thorndike.training.presets import Preset
-from thorndike.training.runner import Runner, runner
+from thorndike.training.runner import Runner, page_length, runner
 from thorndike.training.session import Plan
 from thorndike.training.sources import compiled_source
 from thorndike.types import Algorithm, Environment, EnvSpec, Source, Wrapper
@@ -184,6 +184,9 @@ def _learner(request: Request, spec: EnvSpec, wrapper: Wrapper, network: Network
     if algorithm.needs.warmup_iterations >= plan.iterations:
         warmup = algorithm.needs.warmup_iterations * per_iteration
         raise UserError(f"{request.algorithm}: the first {warmup} steps only fill the memory, so {request.steps} steps would learn nothing")
+    page = page_length(algorithm, request.num_envs)
+    if plan.log_every > page:
+        plan = plan._replace(log_every=math.ceil(plan.log_every / page) * page)
     if request.engine != "native":
         # Host environments start afresh at checkpoints; a run ends at one, so that a longer run passes through the same states.
         plan = plan._replace(iterations=math.ceil(plan.iterations / plan.checkpoint_every) * plan.checkpoint_every)

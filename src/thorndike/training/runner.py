@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int, Key, PyTree
 from thorndike.training.host_source import HostSource
 from thorndike.types import Algorithm, EpisodeStats, Source
 
-_ROWS_OF_A_PAGE = 4_096
+_ROWS_OF_A_PAGE = 1_024
 _RUN_ONCE = {"xla_backend_optimization_level": 0}
 """For programs that run once: compiling them costs more than running them (measured: 1.2 s in place of 5.3 s)."""
 
@@ -114,9 +114,9 @@ def over_seeds(function: Callable) -> Callable:
     return lambda *arguments: jax.lax.map(lambda each: function(*each), arguments)
 
 
-def _page(algorithm: Algorithm, source: Source) -> int:
-    """Iterations whose random numbers are drawn together."""
-    return max(1, _ROWS_OF_A_PAGE // (algorithm.needs.rollout_length * source.spec.num_envs))
+def page_length(algorithm: Algorithm, num_envs: int) -> int:
+    """Iterations whose random numbers are drawn together. Segments that are multiples of it draw nothing in vain."""
+    return max(1, _ROWS_OF_A_PAGE // (algorithm.needs.rollout_length * num_envs))
 
 
 class _PageKeys(NamedTuple):
@@ -136,7 +136,7 @@ def _compiled_segment(
     Pages lie at fixed iterations, so the numbers of an iteration do not depend on how segments are cut. The number of iterations is an
     argument of the compiled program, not part of it: every segment runs the same trace.
     """
-    page = _page(algorithm, source)
+    page = page_length(algorithm, source.spec.num_envs)
 
     def iteration(carry: Carry, noise: PyTree, key: Key[Array, ""]) -> tuple[Carry, Report]:
         state, rollout, episodes = source.collect(carry.source, algorithm.actor(carry.learner), noise)
@@ -185,7 +185,7 @@ def _host_segment(
     algorithm: Algorithm, source: Source, learn: Callable, spent: Stopwatch
 ) -> Callable[[Carry, Key[Array, " S"], int, int], tuple[Carry, Report]]:
     """The same iterations, stepped from Python."""
-    page = _page(algorithm, source)
+    page = page_length(algorithm, source.spec.num_envs)
 
     def prepare(learner: PyTree, loop_key: Key[Array, ""], iteration: Int[Array, ""]) -> tuple[PyTree, PyTree, Key[Array, ""]]:
         keys = _page_keys(loop_key, iteration // page)
