@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from thorndike.api.building import EnvironmentLike, build_algorithm
+from thorndike.api.exporting import POLICY_FORMAT
 from thorndike.environments import registry
 from thorndike.environments.host.gymnasium_engine import LoopEngine
 from thorndike.environments.origins import limit_of
@@ -104,8 +105,8 @@ def load(run: str | Path, *, environment: EnvironmentLike | None = None, network
     if not intact(folder):
         raise UserError(f"the policy in {folder} is damaged: a file is not what its manifest says; resume the run to write it again")
     facts = json.loads((folder / "policy.json").read_text(encoding="utf-8"))
-    if facts.get("format") != 1:
-        raise UserError(f"{folder} has format {facts.get('format')!r}; this version of thorndike reads format 1")
+    if facts.get("format") != POLICY_FORMAT:
+        raise UserError(f"{folder} has format {facts.get('format')!r}; this version of thorndike reads format {POLICY_FORMAT}")
     if facts["network"] == "user" and network is None:
         raise UserError(f"{run} was trained with a network of your own: load it with td.load(run, network=...)")
     wrapper = from_settings(facts["wrappers"])
