@@ -6,22 +6,22 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from thorndike.functional.shuffling import minibatches, permutation
+from thorndike.functional.shuffling import minibatches, permutations
 
 SIZES = (1, 2, 3, 64, 100, 4096, 5000)
 
 
 @pytest.mark.parametrize("n", SIZES)
 def test_every_row_comes_exactly_once(n):
-    order = jax.jit(permutation, static_argnums=1)(jax.random.key(n), n)
-    assert order.dtype == jnp.int32
-    np.testing.assert_array_equal(np.sort(order), np.arange(n))
+    orders = jax.jit(permutations, static_argnums=(1, 2))(jax.random.key(n), 3, n)
+    assert orders.dtype == jnp.int32
+    np.testing.assert_array_equal(np.sort(orders, axis=-1), np.tile(np.arange(n), (3, 1)))
 
 
 @pytest.mark.parametrize("n", [2, 3, 5])
 def test_every_order_of_a_few_rows_is_equally_likely(n):
     draws = 6_000
-    orders = np.asarray(jax.jit(jax.vmap(lambda key: permutation(key, n)))(jax.random.split(jax.random.key(0), draws)))
+    orders = np.asarray(jax.jit(permutations, static_argnums=(1, 2))(jax.random.key(0), draws, n))
     numbers = orders @ n ** np.arange(n)
     _, counts = np.unique(numbers, return_counts=True)
     assert len(counts) == int(np.prod(np.arange(1, n + 1)))
@@ -32,7 +32,7 @@ def test_every_order_of_a_few_rows_is_equally_likely(n):
 def test_each_row_is_equally_likely_in_each_place(n):
     """Rows and places in eight groups: 64 counts that would be equal but for chance."""
     draws = 400
-    orders = np.asarray(jax.jit(jax.vmap(lambda key: permutation(key, n)))(jax.random.split(jax.random.key(1), draws)))
+    orders = np.asarray(jax.jit(permutations, static_argnums=(1, 2))(jax.random.key(1), draws, n))
     places, rows = np.arange(n) * 8 // n, orders * 8 // n
     counts = np.bincount((places * 8 + rows).ravel(), minlength=64).reshape(8, 8)
     group = np.bincount(places)
@@ -44,7 +44,8 @@ def test_each_row_is_equally_likely_in_each_place(n):
 
 
 def test_keys_give_different_orders():
-    assert not np.array_equal(permutation(jax.random.key(0), 100), permutation(jax.random.key(1), 100))
+    a, b = (permutations(jax.random.key(seed), 1, 100) for seed in (0, 1))
+    assert not np.array_equal(a, b)
 
 
 @pytest.mark.parametrize(("n", "batch_size"), [(12, 4), (6, 6), (8, 1)])

@@ -96,5 +96,9 @@ def test_an_agent_has_its_numbers_whatever_the_others():
 
 
 def test_agents_and_runs_have_keys_of_their_own():
-    keys = [tuple(words) for seed in range(20) for words in np.asarray(jax.random.key_data(run_keys(seed, range(20)))).tolist()]
+    keys = [
+        tuple(words)
+        for seed in range(20)
+        for words in np.asarray(jax.random.key_data(run_keys(seed, jnp.arange(20, dtype=jnp.uint32)))).tolist()
+    ]
     assert len(set(keys)) == 400

@@ -92,6 +92,17 @@ class Minibatch(NamedTuple):
     weight: Float[Array, " M"]
 
 
+MINIBATCH_METRICS = (
+    "train/loss",
+    "train/policy_gradient_loss",
+    "train/value_loss",
+    "train/entropy_loss",
+    "train/approx_kl",
+    "train/clip_fraction",
+    "train/grad_norm",
+)
+
+
 def ppo_loss(
     params: PyTree, batch: Minibatch, network: Network, distribution: ActionDistribution, config: Config, clip_range: Float[Array, ""]
 ) -> tuple[Float[Array, ""], Metrics]:
@@ -150,21 +161,23 @@ def improve(
     rate: Float[Array, ""],
     target_kl: float | None,
 ) -> tuple[Float[Array, " P"], PyTree, Bool[Array, ""], Metrics]:
-    """One optimiser step a minibatch: parameters, optimiser, whether the KL stayed in bounds, metrics of every minibatch."""
+    """One optimiser step a minibatch: parameters, optimiser, whether the KL stayed in bounds, mean metrics of the minibatches."""
 
-    def step(carry: tuple[Array, PyTree, Array], indices: Int[Array, " M"]) -> tuple[tuple[Array, PyTree, Array], Metrics]:
+    def step(carry: tuple[Array, PyTree, Array], indices: Int[Array, " M"]) -> tuple[tuple[Array, PyTree, Array], Float[Array, " metrics"]]:
         flat, opt_state, going = carry
         (_, metrics), grads = gradient(flat, jax.tree.map(lambda x: x[indices], batch))
         direction, new_opt_state = optimizer.update(grads, opt_state)
         metrics["train/grad_norm"] = jnp.linalg.norm(grads)
+        # One row, because every array a scan emits is a kernel to compile and to run.
+        row = jnp.stack([metrics[name] for name in MINIBATCH_METRICS])
         if target_kl is None:
-            return (flat - rate * direction, new_opt_state, going), metrics
+            return (flat - rate * direction, new_opt_state, going), row
         going = going & (metrics["train/approx_kl"] <= 1.5 * target_kl)
         new_opt_state = jax.tree.map(lambda new, old: jnp.where(going, new, old), new_opt_state, opt_state)
-        return (jnp.where(going, flat - rate * direction, flat), new_opt_state, going), metrics
+        return (jnp.where(going, flat - rate * direction, flat), new_opt_state, going), row
 
-    (flat, opt_state, going), metrics = jax.lax.scan(step, (flat, opt_state, jnp.array(True)), order)
-    return flat, opt_state, going, metrics
+    (flat, opt_state, going), rows = jax.lax.scan(step, (flat, opt_state, jnp.array(True)), order)
+    return flat, opt_state, going, dict(zip(MINIBATCH_METRICS, jnp.mean(rows, axis=0), strict=True))
 
 
 def ppo(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) -> Algorithm:
@@ -214,7 +227,6 @@ def ppo(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) ->
 
         order = minibatches(key, rows, config.n_epochs, batch_size)
         flat, opt_state, going, metrics = improve(flat, state.opt_state, batch, order, gradient, optimizer, rate, config.target_kl)
-        metrics = jax.tree.map(jnp.mean, metrics)
         metrics["train/explained_variance"] = explained_variance(batch.value, batch.target, batch.weight > 0)
         metrics["train/learning_rate"], metrics["train/clip_range"] = rate, clip
         if config.target_kl is not None:

@@ -7,18 +7,19 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int, Key
 
 
-def permutation(key: Key[Array, ""], n: int) -> Int[Array, " n"]:
-    """A random order of ``range(n)``. Consumes the key.
+def permutations(key: Key[Array, ""], count: int, n: int) -> Int[Array, "{count} {n}"]:
+    """``count`` random orders of ``range(n)``. Consumes the key.
 
     Up to 4096 rows, random high bits and the row number share one 32-bit word, so that one sort of words does it (measured on a CPU: 5x
-    faster than sorting pairs). Two rows then share their random bits with a chance below n^2 / 2^21, and keep their order if they do.
+    faster than sorting pairs), and one draw serves all orders (each place that draws costs 0.3 CPU-seconds to compile). Two rows then
+    share their random bits with a chance below n^2 / 2^21, and keep their order if they do.
     """
     low_bits = max(1, math.ceil(math.log2(n)))
     if low_bits > 12:
-        return jax.random.permutation(key, n)
+        return jax.vmap(lambda k: jax.random.permutation(k, n))(jax.random.split(key, count))
     mask = jnp.uint32((1 << low_bits) - 1)
-    words = (jax.random.bits(key, (n,), jnp.uint32) & ~mask) | jnp.arange(n, dtype=jnp.uint32)
-    return (jnp.sort(words) & mask).astype(jnp.int32)
+    words = (jax.random.bits(key, (count, n), jnp.uint32) & ~mask) | jnp.arange(n, dtype=jnp.uint32)[None]
+    return (jnp.sort(words, axis=-1) & mask).astype(jnp.int32)
 
 
 def minibatches(key: Key[Array, ""], n: int, epochs: int, batch_size: int) -> Int[Array, "minibatches {batch_size}"]:
@@ -26,5 +27,4 @@ def minibatches(key: Key[Array, ""], n: int, epochs: int, batch_size: int) -> In
 
     The rows themselves are gathered where a minibatch is used: a copy of every pass would hold a rollout of images ten times.
     """
-    order = jax.vmap(lambda k: permutation(k, n))(jax.random.split(key, epochs))
-    return order.reshape(-1, batch_size)
+    return permutations(key, epochs, n).reshape(-1, batch_size)

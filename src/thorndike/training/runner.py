@@ -12,7 +12,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Key, PyTree
+from jaxtyping import Array, Float, Int, Key, PyTree, UInt32
 
 from thorndike.training.host_source import HostSource
 from thorndike.types import Algorithm, EpisodeStats, Source
@@ -20,6 +20,8 @@ from thorndike.types import Algorithm, EpisodeStats, Source
 _ROWS_OF_A_PAGE = 1_024
 _RUN_ONCE = {"xla_backend_optimization_level": 0}
 """For programs that run once: compiling them costs more than running them (measured: 1.2 s in place of 5.3 s)."""
+_CALLS_KERNELS: dict[str, str | bool] = {"xla_backend_optimization_level": "1", "xla_cpu_parallel_codegen_split_count": "1"}
+_ONE_FUNCTION: dict[str, str | bool] = {"xla_cpu_parallel_codegen_split_count": "1"}
 
 
 class Stopwatch:
@@ -44,6 +46,8 @@ class Carry(NamedTuple):
 
     learner: PyTree
     source: PyTree
+    loop_key: Key[Array, " S"]
+    """What all random numbers of the loop follow from; it never changes."""
 
 
 class Report(NamedTuple):
@@ -67,36 +71,41 @@ class Runner(NamedTuple):
     """The same by the clock on the wall."""
 
 
-def run_keys(seed: int, indices: Sequence[int]) -> Key[Array, " S"]:
+def run_keys(seed: int, indices: UInt32[Array, " S"]) -> Key[Array, " S"]:
     """One key an agent: ``fold_in(key(seed), index)``. Agent ``i`` is the same alone and among others."""
-    return jax.vmap(lambda index: jax.random.fold_in(jax.random.key(seed), index))(jnp.asarray(indices, jnp.uint32))
+    return jax.vmap(lambda index: jax.random.fold_in(jax.random.key(seed), index))(indices)
 
 
 def runner(algorithm: Algorithm, source: Source | HostSource, seed: int, indices: Sequence[int]) -> Runner:
     """Bind a learner to its source. ``indices`` name the agents of run ``seed``, usually ``range(S)``."""
     plain = source.source if isinstance(source, HostSource) else source
     warmup = algorithm.needs.warmup_iterations
-    keys = jax.jit(jax.vmap(lambda key: jax.random.split(key, 3)))(run_keys(seed, indices))
     spent = Stopwatch()
     make = _compiled_segment if plain.compiled else _host_segment
     learning = make(algorithm, plain, algorithm.update, spent)
     warming = make(algorithm, plain, algorithm.observe, spent)
 
+    def begin(indices: UInt32[Array, " S"]) -> tuple[Carry, Key[Array, " S"]]:
+        keys = jax.vmap(lambda key: jax.random.split(key, 3))(run_keys(seed, indices))
+        state = jax.vmap(plain.init)(keys[:, 1]) if plain.compiled else ()
+        return Carry(jax.vmap(algorithm.init)(keys[:, 0]), state, keys[:, 2]), keys[:, 1]
+
     def init() -> Carry:
         spent.start()
-        learner = jax.jit(jax.vmap(algorithm.init), compiler_options=_RUN_ONCE)(keys[:, 0])
-        state = jax.jit(jax.vmap(plain.init), compiler_options=_RUN_ONCE)(keys[:, 1]) if plain.compiled else plain.init(keys[:, 1])
+        carry, source_keys = jax.jit(begin, compiler_options=_RUN_ONCE)(np.asarray(indices, np.uint32))
+        if not plain.compiled:
+            carry = carry._replace(source=plain.init(source_keys))
         spent.stop()
-        return Carry(learner, state)
+        return carry
 
     def advance(carry: Carry, first: int, count: int) -> tuple[Carry, Report]:
         until = min(max(warmup - first, 0), count)
         if until == 0:
-            return learning(carry, keys[:, 2], first, count)
-        carry, report = warming(carry, keys[:, 2], first, until)
+            return learning(carry, first, count)
+        carry, report = warming(carry, first, until)
         if until == count:
             return carry, report
-        carry, later = learning(carry, keys[:, 2], first + until, count - until)
+        carry, later = learning(carry, first + until, count - until)
         return carry, Report(later.metrics, jax.tree.map(jnp.add, report.episodes, later.episodes))
 
     return Runner(init, advance, algorithm.needs.rollout_length * plain.spec.num_envs, lambda: spent.cpu, lambda: spent.wall)
@@ -112,6 +121,17 @@ def over_seeds(function: Callable) -> Callable:
     if jax.default_backend() != "cpu":
         return jax.vmap(function)
     return lambda *arguments: jax.lax.map(lambda each: function(*each), arguments)
+
+
+def compile_segment(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
+    """Compile with what was measured to be best on a CPU; elsewhere as it is.
+
+    A program with matrix products is a sequence of kernels: optimised less it compiles in 15 % fewer CPU-seconds and runs as fast (PPO,
+    DQN). One without, a table's, is a single function, which would run 15 % slower.
+    """
+    if jax.default_backend() != "cpu":
+        return lowered.compile()
+    return lowered.compile(_CALLS_KERNELS if "dot_general" in lowered.as_text() else _ONE_FUNCTION)
 
 
 def page_length(algorithm: Algorithm, num_envs: int) -> int:
@@ -130,7 +150,7 @@ def _page_keys(loop_key: Key[Array, ""], number: Int[Array, ""]) -> _PageKeys:
 
 def _compiled_segment(
     algorithm: Algorithm, source: Source, learn: Callable, spent: Stopwatch
-) -> Callable[[Carry, Key[Array, " S"], int, int], tuple[Carry, Report]]:
+) -> Callable[[Carry, int, int], tuple[Carry, Report]]:
     """Iterations scanned page by page: the random numbers of a page are drawn at once, outside the inner loop.
 
     Pages lie at fixed iterations, so the numbers of an iteration do not depend on how segments are cut. The number of iterations is an
@@ -138,12 +158,16 @@ def _compiled_segment(
     """
     page = page_length(algorithm, source.spec.num_envs)
 
+    # Jitted so that it is traced once, for the shapes of the report and for the loop alike.
+    @jax.jit
     def iteration(carry: Carry, noise: PyTree, key: Key[Array, ""]) -> tuple[Carry, Report]:
         state, rollout, episodes = source.collect(carry.source, algorithm.actor(carry.learner), noise)
         learner, metrics = learn(carry.learner, rollout, key)
-        return Carry(learner, state), Report(metrics, episodes)
+        return Carry(learner, state, carry.loop_key), Report(metrics, episodes)
 
-    def segment(carry: Carry, loop_key: Key[Array, ""], first: Int[Array, ""], count: Int[Array, ""]) -> tuple[Carry, Report]:
+    def segment(carry: Carry, first: Int[Array, ""], count: Int[Array, ""]) -> tuple[Carry, Report]:
+        loop_key = carry.loop_key
+
         def one_page(number: Int[Array, ""], totals: tuple[Carry, Report]) -> tuple[Carry, Report]:
             keys = _page_keys(loop_key, number)
             noise = source.draw(keys.draw, page)
@@ -164,26 +188,26 @@ def _compiled_segment(
         carry, report = jax.lax.fori_loop(first // page, -(-(first + count) // page), one_page, (carry, empty))
         return carry, report._replace(metrics=jax.tree.map(lambda total: total / count, report.metrics))
 
-    def all_seeds(carry: Carry, loop_keys: Key[Array, " S"], first: Int[Array, ""], count: Int[Array, ""]) -> tuple[Carry, Report]:
-        return over_seeds(lambda one, key: segment(one, key, first, count))(carry, loop_keys)
+    def all_seeds(carry: Carry, first: Int[Array, ""], count: Int[Array, ""]) -> tuple[Carry, Report]:
+        return over_seeds(lambda one: segment(one, first, count))(carry)
 
     traced = jax.jit(all_seeds, donate_argnums=0)
     programs: list[Callable] = []
 
-    def run(carry: Carry, loop_keys: Key[Array, " S"], first: int, count: int) -> tuple[Carry, Report]:
+    def run(carry: Carry, first: int, count: int) -> tuple[Carry, Report]:
         numbers = np.int32(first), np.int32(count)
         if not programs:
             spent.start()
-            programs.append(traced.lower(carry, loop_keys, *numbers).compile())
+            programs.append(compile_segment(traced.lower(carry, *numbers)))
             spent.stop()
-        return programs[0](carry, loop_keys, *numbers)
+        return programs[0](carry, *numbers)
 
     return run
 
 
 def _host_segment(
     algorithm: Algorithm, source: Source, learn: Callable, spent: Stopwatch
-) -> Callable[[Carry, Key[Array, " S"], int, int], tuple[Carry, Report]]:
+) -> Callable[[Carry, int, int], tuple[Carry, Report]]:
     """The same iterations, stepped from Python."""
     page = page_length(algorithm, source.spec.num_envs)
 
@@ -196,8 +220,8 @@ def _host_segment(
     learn_all = jax.jit(over_seeds(learn), donate_argnums=0)
     seen: list[bool] = []
 
-    def run(carry: Carry, loop_keys: Key[Array, " S"], first: int, count: int) -> tuple[Carry, Report]:
-        learner, state = carry
+    def run(carry: Carry, first: int, count: int) -> tuple[Carry, Report]:
+        learner, state, loop_keys = carry
         reports: list[Report] = []
         for iteration in range(first, first + count):
             if not seen:
@@ -211,6 +235,6 @@ def _host_segment(
                 spent.stop()
         metrics = jax.tree.map(lambda *rows: sum(rows) / len(rows), *[report.metrics for report in reports])
         episodes = jax.tree.map(lambda *rows: sum(rows), *[report.episodes for report in reports])
-        return Carry(learner, state), Report(metrics, episodes)
+        return Carry(learner, state, loop_keys), Report(metrics, episodes)
 
     return run

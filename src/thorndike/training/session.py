@@ -137,8 +137,8 @@ def restore(run: Path, runner: Runner, source: PyTree) -> tuple[Carry, Progresse
     stored = load_tree(_restorable(fresh, source), folder / "state.safetensors")
     truncate_lines(run / "metrics.jsonl", int(folder.name))
     if not isinstance(source, HostSource):
-        return Carry(*stored), progressed
-    return Carry(stored[0], source.restart(stored[1], progressed.iteration)), progressed
+        return fresh._replace(learner=stored[0], source=stored[1]), progressed
+    return fresh._replace(learner=stored[0], source=source.restart(stored[1], progressed.iteration)), progressed
 
 
 def _restorable(carry: Carry, source: PyTree) -> tuple[PyTree, PyTree]:

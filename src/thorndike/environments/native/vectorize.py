@@ -66,8 +66,11 @@ def vectorize(dynamics: Dynamics, num_envs: int, max_episode_steps: int | None =
             raise UserError(f"{name} of {dynamics.id} must be at least 1, not {count}: give a larger number")
 
     def draw(key: Key[Array, ""], steps: int) -> Noise:
-        key_step, key_reset = jax.random.split(key)
         shape = (steps, num_envs)
+        if not jax.tree.leaves(jax.eval_shape(lambda k: dynamics.draw_step(k, shape), key)):
+            # Nothing random in a step: no split, because every place that makes random bits costs 0.3 CPU-seconds to compile.
+            return (), dynamics.draw_reset(key, shape)
+        key_step, key_reset = jax.random.split(key)
         return dynamics.draw_step(key_step, shape), dynamics.draw_reset(key_reset, shape)
 
     def init(key: Key[Array, ""]) -> tuple[VectorState, Observation]:
