@@ -37,6 +37,8 @@ BARS = (
     Bar("ppo", "CartPole-v1", "iqm", 495, worst=475),
     Bar("ppo", "Pendulum-v1", "mean", -185),
     Bar("ppo", "LunarLander-v3", "mean", 235),
+    Bar("a2c", "CartPole-v1", "iqm", 490),
+    Bar("reinforce", "CartPole-v1", "iqm", 475),
     Bar("dqn", "CartPole-v1", "iqm", 490),
     Bar("dqn", "Acrobot-v1", "mean", -82),
     Bar("dqn", "MountainCar-v0", "iqm", -110),
@@ -103,7 +105,7 @@ def write(content: dict) -> Path:
 def tables() -> None:
     """Write the tables of the README and of the algorithms' pages from the JSON files."""
     results = [json.loads(path.read_text()) for path in sorted(RESULTS.glob("*.json"))]
-    for algorithm in ("ppo", "dqn"):
+    for algorithm in ("ppo", "dqn", "a2c", "reinforce"):
         own = [result for result in results if result["bar"]["algorithm"] == algorithm]
         head = ["environment", "steps", "mean", "IQM", "worst seed", "95 % interval of the mean", "bar", "CPU-s, 10 seeds", "command"]
         _replace(ROOT / "docs" / "algorithms" / f"{algorithm}.md", [head, *(_row(result) for result in own)])

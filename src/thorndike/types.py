@@ -11,10 +11,11 @@ import gymnasium
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
 Observation: TypeAlias = PyTree
-"""An array ``[B, ...]``, or a dict/tuple of them where the space is a Dict or Tuple."""
+"""An array ``[B, ...]``, or a dict/tuple of them where the space is a Dict or Tuple. Its entry ``action_mask``, if it has one, says which
+actions are allowed: masks come in with the observation."""
 
 Action: TypeAlias = PyTree
-"""``int32[B]`` (Discrete), ``int32[B, K]`` (MultiDiscrete) or ``float32[B, D]`` (Box)."""
+"""``int32[B]`` (Discrete), ``int32[B, K]`` (MultiDiscrete, MultiBinary) or ``float32[B, D]`` (Box)."""
 
 Noise: TypeAlias = PyTree
 """Random numbers drawn ahead of a scan; its leading axis is time. By default one PRNG key a step."""
@@ -44,7 +45,6 @@ class Step(NamedTuple):
     truncated: Bool[Array, "*batch"]
     valid: Bool[Array, "*batch"]
     """False only on the dead row that next-step autoreset makes: it is no transition."""
-    action_mask: Bool[Array, "*batch n"] | None = None
 
     @property
     def done(self) -> Bool[Array, "*batch"]:
@@ -132,7 +132,7 @@ class Algorithm(NamedTuple):
     greedy: Callable[[PyTree, PyTree, Observation, Noise], tuple[PyTree, Action, PyTree]]
     """The evaluation policy, with the signature of ``act``."""
     value: Callable[[PyTree, Observation], Float[Array, "*batch"]]
-    """Actor, obs -> the learner's estimate of the state's value."""
+    """Actor, obs -> the learner's estimate of the state's value; with memory, as at the beginning of an episode."""
     update: Callable[[PyTree, Rollout, Key[Array, ""]], tuple[PyTree, Metrics]]
     """State, rollout, key -> State, metrics: one iteration of learning. Consumes the key."""
     observe: Callable[[PyTree, Rollout, Key[Array, ""]], tuple[PyTree, Metrics]]

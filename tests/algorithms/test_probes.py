@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from thorndike.algorithms import dqn, ppo, q_learning
+from thorndike.algorithms import a2c, dqn, ppo, q_learning, reinforce
 from thorndike.environments import wrappers
 from thorndike.environments.native import factory
 from thorndike.environments.native.randomness import draw_words
@@ -129,6 +129,16 @@ def ppo_for(iterations: int, spec: EnvSpec, **settings) -> Algorithm:
     return ppo.ppo(ppo.Config(total_steps=iterations * 20 * NUM_ENVS, **(config | settings)), spec)
 
 
+def a2c_for(iterations: int, spec: EnvSpec, **settings) -> Algorithm:
+    config = {"n_steps": 10, "gamma": GAMMA, "learning_rate": "linear(0.01, 0)", "net_arch": (16,)}
+    return a2c.a2c(a2c.Config(total_steps=iterations * 10 * NUM_ENVS, **(config | settings)), spec)
+
+
+def reinforce_for(iterations: int, spec: EnvSpec, **settings) -> Algorithm:
+    config = {"n_steps": 20, "gamma": GAMMA, "learning_rate": "linear(0.02, 0)", "net_arch": (16,), "max_grad_norm": 10.0}
+    return reinforce.reinforce(reinforce.Config(total_steps=iterations * 20 * NUM_ENVS, **(config | settings)), spec)
+
+
 def dqn_for(iterations: int, spec: EnvSpec, **parts) -> Algorithm:
     config = dqn.Config(
         **parts,
@@ -167,10 +177,14 @@ def normalising() -> Wrapper:
 CASES = {
     "ppo": lambda: learn(DISCRETE, partial(ppo_for, 60), 60),
     "ppo, Box": lambda: learn(BOX, partial(ppo_for, 60, log_std_init=-2.0), 60),
+    "a2c": lambda: learn(DISCRETE, partial(a2c_for, 600), 600),
+    "reinforce": lambda: learn(DISCRETE, partial(reinforce_for, 400), 400),
     "dqn": lambda: learn(DISCRETE, partial(dqn_for, 1200), 1200),
     "q_learning": lambda: learn(DISCRETE, partial(table_for, 60, "q_learning"), 60, wrappers.discretise(3)),
 }
 SLOW_CASES = {
+    "a2c, Box": lambda: learn(BOX, partial(a2c_for, 600, log_std_init=-2.0), 600),
+    "reinforce, Box": lambda: learn(BOX, partial(reinforce_for, 400, log_std_init=-2.0), 400),
     "dqn, double, dueling, 3 steps": lambda: learn(DISCRETE, partial(dqn_for, 1200, double=True, dueling=True, n_step=3), 1200),
     "sarsa": lambda: learn(DISCRETE, partial(table_for, 100, "sarsa"), 100, wrappers.discretise(3)),
     "expected sarsa": lambda: learn(DISCRETE, partial(table_for, 100, "expected_sarsa"), 100, wrappers.discretise(3)),

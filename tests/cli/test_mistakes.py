@@ -12,7 +12,7 @@ from thorndike.cli.main import main
 MISTAKES = [
     (["trian", "ppo"], "there is no verb 'trian'; did you mean 'train'?"),
     (["--steps"], "unknown flag --steps; the verb comes first"),
-    (["train"], "which algorithm? One of ppo, dqn, q_learning, planning"),
+    (["train"], "which algorithm? One of ppo, a2c, reinforce, dqn, q_learning, planning"),
     (["train", "ppo"], "which environment? Name one, as in: thorndike train ppo CartPole-v1"),
     (["train", "pppo", "CartPole-v1"], "there is no algorithm 'pppo'; did you mean 'ppo'?"),
     (["train", "CartPole-v1", "ppo"], "the algorithm comes first: thorndike train ppo CartPole-v1"),
@@ -43,6 +43,9 @@ MISTAKES = [
     (["watch", "latest", "--video", "a.gif"], "--video a.gif: a film is written as .mp4"),
     (["resume", "latest", "--steps", "-5"], "expected a whole number of at least 1"),
     (["plot", "latest", "--file", "a.bmp"], "--file a.bmp: a plot is written as .png, .svg, .pdf"),
+    (["compare"], "the following arguments are required: RUN"),
+    (["compare", "latest", "other"], "runs/ holds no run yet; make one: thorndike train ppo CartPole-v1"),
+    (["compare", "latest", "--plot", "a.bmp"], "a plot is written as .png, .svg, .pdf; got 'a.bmp'"),
     (["list", "algos"], "cannot list 'algos'; did you mean 'algorithms'?"),
     (["list", "settings"], "whose settings?"),
     (["list", "settings", "pppo"], "there is no algorithm 'pppo'; did you mean 'ppo'?"),
@@ -75,6 +78,7 @@ REFUSED_EARLY = [
     ["train", "ppo", "CartPol-v1"],
     ["eval", "nothing"],
     ["plot", "nothing"],
+    ["compare", "nothing", "other"],
 ]
 
 

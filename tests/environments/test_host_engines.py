@@ -17,7 +17,9 @@ from environments.counting_environments import (
     WrongShapeEnv,
     length_of,
 )
-from thorndike.environments.host.gymnasium_engine import LoopEngine, VectorEngine, subprocess_engine
+from thorndike.environments.host.gymnasium_engine import LoopEngine
+from thorndike.environments.host.subprocess_engine import SubprocessEngine
+from thorndike.environments.host.vector_engine import VectorEngine
 from thorndike.environments.native import factory
 from thorndike.environments.native.vectorize import vectorize
 from thorndike.environments.origins import make_single
@@ -46,7 +48,7 @@ COUNTED = {
     "sync same step": (partial(sync_engine, AutoresetMode.SAME_STEP), 40, 130_000),
     "sync next step": (partial(sync_engine, AutoresetMode.NEXT_STEP), 40, 130_000),
     "sync disabled": (partial(sync_engine, AutoresetMode.DISABLED), 40, 130_000),
-    "subprocess": (lambda count: subprocess_engine([MAKE] * count, "counting"), 2, 10_000),
+    "subprocess": (lambda count: SubprocessEngine([MAKE] * count, "counting"), 2, 10_000),
     "async next step": (partial(async_engine, AutoresetMode.NEXT_STEP), 2, 10_000),
     "async disabled": (partial(async_engine, AutoresetMode.DISABLED), 2, 10_000),
 }
@@ -207,7 +209,7 @@ def check_dict(batch: dict, episode: np.ndarray, count: np.ndarray) -> None:
     [
         lambda: LoopEngine([MAKE_DICT] * 3, "dict"),
         *(lambda mode=mode: VectorEngine(SyncVectorEnv([MAKE_DICT] * 3, autoreset_mode=mode), "dict") for mode in AutoresetMode),
-        lambda: subprocess_engine([MAKE_DICT] * 3, "dict"),
+        lambda: SubprocessEngine([MAKE_DICT] * 3, "dict"),
     ],
     ids=["loop", *(mode.name for mode in AutoresetMode), "subprocess"],
 )

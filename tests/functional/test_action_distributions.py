@@ -116,7 +116,8 @@ def test_each_space_has_its_distribution(space, outputs, free, shape):
 
 
 @pytest.mark.parametrize(
-    "space", [spaces.Box(0, 255, (3,), np.uint8), spaces.Box(-1, 1, (2, 2)), spaces.MultiBinary(3), spaces.Dict({"a": spaces.Discrete(2)})]
+    "space",
+    [spaces.Box(0, 255, (3,), np.uint8), spaces.Box(-1, 1, (2, 2)), spaces.MultiBinary((3, 2)), spaces.Dict({"a": spaces.Discrete(2)})],
 )
 def test_a_space_without_a_distribution_is_refused_in_one_line(space):
     with pytest.raises(UserError, match="actions may be Discrete, MultiDiscrete") as error:

@@ -17,7 +17,8 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from thorndike.algorithms import ppo
 from thorndike.api import resume, train
 from thorndike.environments import wrappers
-from thorndike.environments.host.gymnasium_engine import LoopEngine, VectorEngine
+from thorndike.environments.host.gymnasium_engine import LoopEngine
+from thorndike.environments.host.vector_engine import VectorEngine
 from thorndike.environments.native import factory
 from thorndike.environments.native.randomness import no_noise
 from thorndike.environments.native.vectorize import vectorize

@@ -12,7 +12,8 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from thorndike.algorithms import ppo
 from thorndike.environments import wrappers
-from thorndike.environments.host.gymnasium_engine import LoopEngine, VectorEngine
+from thorndike.environments.host.gymnasium_engine import LoopEngine
+from thorndike.environments.host.vector_engine import VectorEngine
 from thorndike.training.evaluation import evaluate
 from thorndike.training.policy import Policy
 from thorndike.types import EnvSpec

@@ -24,12 +24,15 @@ from jaxtyping import Array, Float, Int, Key, PyTree
 
 from thorndike.errors import UserError
 from thorndike.functional.exploration import epsilon_greedy
+from thorndike.functional.guards import accept_if, all_finite
 from thorndike.functional.policy_losses import weighted_mean
 from thorndike.functional.schedules import schedule
-from thorndike.networks.heads import q_values
-from thorndike.networks.network import Network, NetworkBuilder
-from thorndike.networks.torso import ACTIVATIONS
-from thorndike.replay.uniform import ReplayBuffer, Transitions, add, init_replay, row_shapes, sample
+from thorndike.networks.heads import Shape, q_network
+from thorndike.networks.masking import allowed, has_mask
+from thorndike.networks.network import Network, NetworkBuilder, apply_rollout, apply_step, flattened, fresh_memory
+from thorndike.networks.recurrent import MEMORIES
+from thorndike.networks.torso import ACTIVATIONS, example_observation
+from thorndike.replay.uniform import ReplayBuffer, Transitions, add, init_replay, row_shapes, sample, sample_sequences
 from thorndike.settings import AtLeast, Between, MoreThan, OneOf, check
 from thorndike.types import Algorithm, EnvSpec, Metrics, Needs, Observation, Rollout
 
@@ -55,6 +58,9 @@ class Config:
     double: bool = False  # choose the next action by the network, value it by the target
     dueling: bool = False  # separate streams for value and advantages
     n_step: Annotated[int, AtLeast(1)] = 1  # rewards summed before bootstrapping
+    memory: Annotated[str, OneOf(*MEMORIES)] = "none"  # recurrent memory of the network
+    memory_size: Annotated[int, AtLeast(1)] = 64  # its width
+    sequence_length: Annotated[int, AtLeast(2)] = 16  # with memory: steps of a sampled sequence; a minibatch holds batch_size in all
     net_arch: tuple[int, ...] = (64, 64)  # widths of the hidden layers
     activation: Annotated[str, OneOf(*ACTIVATIONS)] = "relu"  # after each hidden layer
 
@@ -79,19 +85,41 @@ class Actor(NamedTuple):
     epsilon: Float[Array, ""]
 
 
-def dqn_loss(params: PyTree, target_params: PyTree, batch: Transitions, network: Network, double: bool) -> tuple[Float[Array, ""], Metrics]:
-    """Huber loss of the temporal-difference errors of a minibatch: Mnih et al. 2015, eq. 2; with ``double``, van Hasselt et al., eq. 4."""
-    next_target = network.apply(target_params, batch.next_obs)
-    if double:
-        best = jnp.argmax(network.apply(params, batch.next_obs), axis=-1)
-        next_value = jnp.sum(next_target * jax.nn.one_hot(best, next_target.shape[-1]), axis=-1)
-    else:
+def q_loss(
+    q: Float[Array, "*M A"],
+    next_online: Float[Array, "*M A"] | None,
+    next_target: Float[Array, "*M A"],
+    batch: Transitions,
+) -> tuple[Float[Array, ""], Metrics]:
+    """Huber loss of temporal-difference errors: Mnih et al. 2015, eq. 2; given the network's own next values, van Hasselt et al., eq. 4."""
+    if next_online is None:
         next_value = jnp.max(next_target, axis=-1)
+    else:
+        best = jax.nn.one_hot(jnp.argmax(next_online, axis=-1), next_target.shape[-1])
+        next_value = jnp.sum(jnp.where(best > 0, next_target, 0.0), axis=-1)
     target = jax.lax.stop_gradient(batch.reward + batch.discount * next_value)
-    q = network.apply(params, batch.obs)
-    chosen = jnp.sum(q * jax.nn.one_hot(batch.action, q.shape[-1]), axis=-1)
+    # A masked sum, because a forbidden action's value is so low that a product with 0 would lose all digits of the others.
+    chosen = jnp.sum(jnp.where(jax.nn.one_hot(batch.action, q.shape[-1]) > 0, q, 0.0), axis=-1)
     loss = weighted_mean(optax.losses.huber_loss(chosen, target), batch.weight)
     return loss, {"train/loss": loss, "train/q_mean": jnp.mean(chosen)}
+
+
+def dqn_loss(params: PyTree, target_params: PyTree, batch: Transitions, network: Network, double: bool) -> tuple[Float[Array, ""], Metrics]:
+    """The loss of a minibatch of transitions."""
+    next_online = network.apply(params, batch.next_obs) if double else None
+    return q_loss(network.apply(params, batch.obs), next_online, network.apply(target_params, batch.next_obs), batch)
+
+
+def sequence_loss(
+    params: PyTree, target_params: PyTree, sequences: Rollout, network: Network, double: bool, gamma: float
+) -> tuple[Float[Array, ""], Metrics]:
+    """The loss of sequences ``[T, M]``, whose memories both networks unroll from the stored one (Hausknecht and Stone 2015, R2D2)."""
+    q, next_online = apply_rollout(network, params, sequences)
+    _, next_target = apply_rollout(network, target_params, sequences)
+    step = sequences.step
+    discount, weight = jnp.where(step.terminated, 0.0, gamma), step.valid.astype(jnp.float32)
+    batch = Transitions(sequences.obs, sequences.action, step.reward, step.next_obs, discount, weight)
+    return q_loss(q, next_online if double else None, next_target, batch)
 
 
 def sizes(config: Config, num_envs: int) -> tuple[int, int, int]:
@@ -99,49 +127,61 @@ def sizes(config: Config, num_envs: int) -> tuple[int, int, int]:
     rollout_length = max(1, config.train_freq // num_envs)
     per_iteration = rollout_length * num_envs
     blocks = max(1, config.buffer_size // per_iteration)
-    enough_for_a_sample = -(-(config.n_step + 1) // rollout_length)
+    follow = config.sequence_length if config.memory != "none" else config.n_step
+    enough_for_a_sample = -(-(follow + 1) // rollout_length)
     warmup = max(enough_for_a_sample, -(-config.learning_starts // per_iteration))
     if blocks < enough_for_a_sample:
-        raise UserError(f"dqn: buffer_size {config.buffer_size} holds fewer than n_step + 1 = {config.n_step + 1} steps; make it larger")
+        raise UserError(f"dqn: buffer_size {config.buffer_size} holds fewer than the {follow + 1} steps of a sample; make it larger")
     return rollout_length, blocks * rollout_length, warmup
 
 
 def dqn(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) -> Algorithm:
     """DQN for an environment with Discrete actions. Raises ``UserError`` for other action spaces."""
     if not isinstance(spec.action_space, gymnasium.spaces.Discrete):
-        raise UserError(f"dqn takes Discrete actions; {spec.id} has {spec.action_space}; ppo takes Discrete, MultiDiscrete and Box actions")
+        raise UserError(f"dqn takes Discrete actions; {spec.id} has {spec.action_space}; ppo, a2c and reinforce take the others")
     actions = int(spec.action_space.n)
     rollout_length, ring_steps, warmup = sizes(config, spec.num_envs)
     per_iteration = rollout_length * spec.num_envs
     target_every = max(1, config.target_update_interval // per_iteration)
-    if network is None:
-        net = q_values(spec.observation_space, actions, config.net_arch, config.activation, config.dueling)
-    else:
-        net = network(spec, actions)
+    shape = Shape(config.net_arch, config.activation, config.memory, config.memory_size)
+    net = q_network(spec, actions, shape, config.dueling, network)
+    if net.recurrence is not None and config.n_step > 1:
+        raise UserError(f"dqn with memory learns from single steps: set n_step to 1, not {config.n_step}")
     optimizer = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam())
     learning_rate = schedule(config.learning_rate)
     final, fraction = config.exploration_final_eps, min(config.exploration_fraction, 1.0)
     exploration = schedule(f"linear({config.exploration_initial_eps}, {final}, {fraction})")
-    example = jax.tree.map(lambda x: jnp.zeros((1, *x.shape), jnp.asarray(x).dtype), spec.observation_space.sample())
+    example = example_observation(spec.observation_space)
     # Parameters travel as one flat vector: optimiser, target and gradient are then a few kernels, not a few a layer.
-    template = jax.eval_shape(net.init, jax.random.key(0), example)
-    _, unravel = ravel_pytree(jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), template))
-    flat_net = Network(net.init, lambda flat, obs: net.apply(unravel(flat), obs))
+    flat_net = flattened(net, example)
+    sequences = max(1, config.batch_size // config.sequence_length)
 
     def init(key: Key[Array, ""]) -> State:
         params = ravel_pytree(net.init(key, example))[0]
-        replay = init_replay(row_shapes(spec), ring_steps, spec.num_envs)
+        replay = init_replay(row_shapes(spec, fresh_memory(net, 1)), ring_steps, spec.num_envs)
         return State(params, jnp.array(params), optimizer.init(params), replay, jnp.zeros((), jnp.int32))
 
     def actor(state: State) -> Actor:
         return Actor(state.params, exploration(state.env_steps / config.total_steps))
 
     def act(actor: Actor, memory: PyTree, obs: Observation, noise: Float[Array, " B"]) -> tuple[PyTree, Int[Array, " B"], PyTree]:
-        choice = epsilon_greedy(flat_net.apply(actor.params, obs), actor.epsilon, noise, random_ties=False)
-        return memory, choice.action, {}
+        later, q = apply_step(flat_net, actor.params, memory, obs)
+        mask = allowed(obs) if has_mask(spec.observation_space) else None
+        choice = epsilon_greedy(q, actor.epsilon, noise, random_ties=False, allowed=mask)
+        return later, choice.action, {"memory": memory}
 
     def greedy(actor: Actor, memory: PyTree, obs: Observation, noise: PyTree) -> tuple[PyTree, Int[Array, " B"], PyTree]:
-        return memory, jnp.argmax(flat_net.apply(actor.params, obs), axis=-1).astype(jnp.int32), {}
+        memory, q = apply_step(flat_net, actor.params, memory, obs)
+        return memory, jnp.argmax(q, axis=-1).astype(jnp.int32), {}
+
+    def loss(params: Array, target_params: Array, replay: ReplayBuffer, key: Key[Array, ""]) -> tuple[Array, Metrics]:
+        if net.recurrence is None:
+            batch = sample(replay, key, config.batch_size, spec.num_envs, config.n_step, config.gamma)
+            return dqn_loss(params, target_params, batch, flat_net, config.double)
+        rollout = sample_sequences(replay, key, sequences, config.sequence_length, spec.num_envs)
+        return sequence_loss(params, target_params, rollout, flat_net, config.double, config.gamma)
+
+    gradient = jax.grad(loss, has_aux=True)
 
     def observe(state: State, rollout: Rollout, key: Key[Array, ""]) -> tuple[State, Metrics]:
         metrics = {"rollout/exploration_rate": actor(state).epsilon}
@@ -153,10 +193,11 @@ def dqn(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) ->
 
         def learn(carry: tuple[Array, PyTree], key: Key[Array, ""]) -> tuple[tuple[Array, PyTree], Metrics]:
             params, opt_state = carry
-            batch = sample(replay, key, config.batch_size, spec.num_envs, config.n_step, config.gamma)
-            grads, metrics = jax.grad(dqn_loss, has_aux=True)(params, state.target_params, batch, flat_net, config.double)
-            direction, opt_state = optimizer.update(grads, opt_state)
-            return (params - rate * direction, opt_state), {**metrics, "train/grad_norm": jnp.linalg.norm(grads)}
+            grads, metrics = gradient(params, state.target_params, replay, key)
+            direction, new_opt_state = optimizer.update(grads, opt_state)
+            metrics["train/grad_norm"] = jnp.linalg.norm(grads)
+            accepted = all_finite(metrics["train/loss"], metrics["train/grad_norm"])
+            return accept_if(accepted, (params - rate * direction, new_opt_state), (params, opt_state)), metrics
 
         keys = jax.random.split(key, config.gradient_steps)
         (params, opt_state), metrics = jax.lax.scan(learn, (state.params, state.opt_state), keys)
@@ -169,7 +210,7 @@ def dqn(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) ->
     return Algorithm(
         init=init,
         actor=actor,
-        memory=lambda batch: (),
+        memory=lambda batch: fresh_memory(net, batch),
         draw=lambda key, steps: jax.random.uniform(key, (steps, spec.num_envs)),
         act=act,
         greedy=greedy,

@@ -4,7 +4,7 @@ Schulman, Wolski, Dhariwal, Radford, Klimov 2017, "Proximal Policy Optimization 
 al. 2016 (arXiv:1506.02438). Deviations from the paper:
 
 1. Advantages are standardised in each minibatch, gradients clipped by their global norm, weights orthogonal, as in OpenAI's PPO2.
-2. Policy and value have separate networks (one shared torso on images).
+2. Policy and value have separate networks (one shared torso on images, and with memory, whose minibatches are whole sequences).
 3. A step cut by a time limit bootstraps from the observation it was cut at, not from the next episode's first one.
 4. Box actions are chosen in [-1, 1] and mapped to the bounds; what lies outside is clipped by the environment's source, not squashed.
 5. With ``target_kl`` the remaining minibatches of an iteration are skipped once the KL estimate passes 1.5 times the target.
@@ -25,7 +25,8 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from thorndike.errors import UserError
-from thorndike.functional.action_distributions import ActionDistribution, action_distribution
+from thorndike.functional.action_distributions import ActionDistribution, action_distribution, saturation
+from thorndike.functional.guards import accept_if, all_finite
 from thorndike.functional.policy_losses import (
     approximate_kl,
     clip_fraction,
@@ -38,9 +39,10 @@ from thorndike.functional.policy_losses import (
 from thorndike.functional.returns import generalized_advantage
 from thorndike.functional.schedules import schedule
 from thorndike.functional.shuffling import minibatches
-from thorndike.networks.heads import actor_critic
-from thorndike.networks.network import Network, NetworkBuilder
-from thorndike.networks.torso import ACTIVATIONS
+from thorndike.networks.heads import Shape, policy_network
+from thorndike.networks.network import Network, NetworkBuilder, apply_rollout, apply_step, as_rows, begins_episode, fresh_memory
+from thorndike.networks.recurrent import MEMORIES
+from thorndike.networks.torso import ACTIVATIONS, example_observation
 from thorndike.settings import AtLeast, Between, MoreThan, OneOf, check
 from thorndike.types import Algorithm, EnvSpec, Metrics, Needs, Observation, Rollout
 
@@ -66,6 +68,8 @@ class Config:
     net_arch: tuple[int, ...] = (64, 64)  # widths of the hidden layers
     activation: Annotated[str, OneOf(*ACTIVATIONS)] = "tanh"  # after each hidden layer
     log_std_init: float = 0.0  # log standard deviation at the start (Box actions)
+    memory: Annotated[str, OneOf(*MEMORIES)] = "none"  # recurrent memory of the network
+    memory_size: Annotated[int, AtLeast(1)] = 64  # its width
 
     def __post_init__(self) -> None:
         check(self)
@@ -81,15 +85,19 @@ class State(NamedTuple):
 
 
 class Minibatch(NamedTuple):
-    """Rows of a rollout as the loss needs them, ``[M, ...]``."""
+    """What the loss needs: rows of a rollout ``[M, ...]``, or with memory whole sequences ``[T, M, ...]``."""
 
     obs: Observation
     action: PyTree
-    log_prob: Float[Array, " M"]
-    value: Float[Array, " M"]
-    advantage: Float[Array, " M"]
-    target: Float[Array, " M"]
-    weight: Float[Array, " M"]
+    log_prob: Float[Array, "*M"]
+    value: Float[Array, "*M"]
+    advantage: Float[Array, "*M"]
+    target: Float[Array, "*M"]
+    weight: Float[Array, "*M"]
+    begins: Bool[Array, "*M"]
+    """Whether a step is the first of its episode; without memory it is not looked at."""
+    memory: PyTree
+    """The memory before the first step ``[1, M, ...]``, or ``()``."""
 
 
 MINIBATCH_METRICS = (
@@ -107,7 +115,10 @@ def ppo_loss(
     params: PyTree, batch: Minibatch, network: Network, distribution: ActionDistribution, config: Config, clip_range: Float[Array, ""]
 ) -> tuple[Float[Array, ""], Metrics]:
     """The loss of one minibatch and what is logged of it: paper, eq. 9, with its signs turned."""
-    parameters, value = network.apply(params, batch.obs)
+    if network.recurrence is None:
+        parameters, value = network.apply(params, batch.obs)
+    else:
+        _, (parameters, value) = network.recurrence.unroll(params, jax.tree.map(lambda x: x[0], batch.memory), batch.obs, batch.begins)
     log_ratio = distribution.log_prob(parameters, batch.action) - batch.log_prob
     advantage = standardize(batch.advantage, batch.weight) if config.normalize_advantage else batch.advantage
     policy = clipped_surrogate(log_ratio, advantage, clip_range, batch.weight)
@@ -126,16 +137,9 @@ def ppo_loss(
 
 
 def prepare(rollout: Rollout, params: PyTree, network: Network, config: Config) -> Minibatch:
-    """Values, advantages and value targets of a whole rollout, as rows ``[T * B, ...]``."""
+    """Values, advantages and value targets of a whole rollout: as rows ``[T * B, ...]``, or with memory as it is, ``[T, B, ...]``."""
     step = rollout.step
-    length, num_envs = step.reward.shape
-
-    def as_rows(x: Array) -> Array:
-        return x.reshape((length * num_envs, *x.shape[2:]))
-
-    # One pass over observations and true successors together: large batches are cheap, and no boundary needs a special case.
-    both = jax.tree.map(lambda now, then: jnp.concatenate([as_rows(now), as_rows(then)]), rollout.obs, step.next_obs)
-    value, next_value = network.apply(params, both)[1].reshape((2, length, num_envs))
+    (_, value), (_, next_value) = apply_rollout(network, params, rollout)
     advantage = generalized_advantage(
         step.reward, value, next_value, step.terminated, step.done | ~step.valid, config.gamma, config.gae_lambda
     )
@@ -147,8 +151,10 @@ def prepare(rollout: Rollout, params: PyTree, network: Network, config: Config) 
         advantage=advantage,
         target=advantage + value,
         weight=step.valid.astype(jnp.float32),
+        begins=begins_episode(rollout),
+        memory=jax.tree.map(lambda x: x[None], rollout.memory),
     )
-    return jax.tree.map(as_rows, batch)
+    return as_rows(batch) if network.recurrence is None else batch
 
 
 def improve(
@@ -160,21 +166,21 @@ def improve(
     optimizer: optax.GradientTransformation,
     rate: Float[Array, ""],
     target_kl: float | None,
+    sequences: bool,
 ) -> tuple[Float[Array, " P"], PyTree, Bool[Array, ""], Metrics]:
     """One optimiser step a minibatch: parameters, optimiser, whether the KL stayed in bounds, mean metrics of the minibatches."""
 
     def step(carry: tuple[Array, PyTree, Array], indices: Int[Array, " M"]) -> tuple[tuple[Array, PyTree, Array], Float[Array, " metrics"]]:
         flat, opt_state, going = carry
-        (_, metrics), grads = gradient(flat, jax.tree.map(lambda x: x[indices], batch))
+        (_, metrics), grads = gradient(flat, jax.tree.map(lambda x: x[:, indices] if sequences else x[indices], batch))
         direction, new_opt_state = optimizer.update(grads, opt_state)
         metrics["train/grad_norm"] = jnp.linalg.norm(grads)
         # One row, because every array a scan emits is a kernel to compile and to run.
         row = jnp.stack([metrics[name] for name in MINIBATCH_METRICS])
-        if target_kl is None:
-            return (flat - rate * direction, new_opt_state, going), row
-        going = going & (metrics["train/approx_kl"] <= 1.5 * target_kl)
-        new_opt_state = jax.tree.map(lambda new, old: jnp.where(going, new, old), new_opt_state, opt_state)
-        return (jnp.where(going, flat - rate * direction, flat), new_opt_state, going), row
+        going = going & all_finite(metrics["train/loss"], metrics["train/grad_norm"])
+        going = going if target_kl is None else going & (metrics["train/approx_kl"] <= 1.5 * target_kl)
+        flat, opt_state = accept_if(going, (flat - rate * direction, new_opt_state), (flat, opt_state))
+        return (flat, opt_state, going), row
 
     (flat, opt_state, going), rows = jax.lax.scan(step, (flat, opt_state, jnp.array(True)), order)
     return flat, opt_state, going, dict(zip(MINIBATCH_METRICS, jnp.mean(rows, axis=0), strict=True))
@@ -182,40 +188,34 @@ def improve(
 
 def ppo(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) -> Algorithm:
     """PPO for an environment. Raises ``UserError`` where a rollout does not divide into minibatches or the space is not supported."""
-    rows = config.n_steps * spec.num_envs
-    batch_size = min(config.batch_size, rows)
-    if rows % batch_size:
+    distribution = action_distribution(spec.action_space)
+    shape = Shape(config.net_arch, config.activation, config.memory, config.memory_size)
+    net = policy_network(spec, distribution, shape, config.log_std_init, network)
+    rows, sequences = config.n_steps * spec.num_envs, net.recurrence is not None
+    # With memory a minibatch is made of whole sequences, one an environment.
+    items, each = (spec.num_envs, config.n_steps) if sequences else (rows, 1)
+    per_minibatch = min(max(1, config.batch_size // each), items)
+    if items % per_minibatch:
         raise UserError(
             f"ppo: n_steps x environments = {config.n_steps} x {spec.num_envs} = {rows} rows do not divide into minibatches of "
-            f"batch_size {config.batch_size}; choose a batch_size that divides {rows}"
+            f"batch_size {config.batch_size}; choose a batch_size that divides {rows}" + (f" and {each} divides" if sequences else "")
         )
-    distribution = action_distribution(spec.action_space)
-    if network is None:
-        net = actor_critic(
-            spec.observation_space,
-            distribution.network_outputs,
-            distribution.free_parameters,
-            config.net_arch,
-            config.activation,
-            config.log_std_init,
-        )
-    else:
-        net = network(spec, distribution.network_outputs + distribution.free_parameters)
     optimizer = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam(eps=1e-5))
     learning_rate, clip_range = schedule(config.learning_rate), schedule(config.clip_range)
-    example = jax.tree.map(lambda x: jnp.zeros((1, *x.shape), jnp.asarray(x).dtype), spec.observation_space.sample())
+    example = example_observation(spec.observation_space)
 
     def init(key: Key[Array, ""]) -> State:
         params = net.init(key, example)
         return State(params, optimizer.init(ravel_pytree(params)[0]), jnp.zeros((), jnp.int32))
 
     def act(params: PyTree, memory: PyTree, obs: Observation, noise: PyTree) -> tuple[PyTree, PyTree, PyTree]:
-        parameters, _ = net.apply(params, obs)
+        memory, (parameters, _) = apply_step(net, params, memory, obs)
         action = distribution.sample(parameters, noise)
         return memory, action, {"log_prob": distribution.log_prob(parameters, action)}
 
     def greedy(params: PyTree, memory: PyTree, obs: Observation, noise: PyTree) -> tuple[PyTree, PyTree, PyTree]:
-        return memory, distribution.mode(net.apply(params, obs)[0]), {}
+        memory, (parameters, _) = apply_step(net, params, memory, obs)
+        return memory, distribution.mode(parameters), {}
 
     def update(state: State, rollout: Rollout, key: Key[Array, ""]) -> tuple[State, Metrics]:
         progress = state.env_steps / config.total_steps
@@ -225,8 +225,11 @@ def ppo(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) ->
         flat, unravel = ravel_pytree(state.params)
         gradient = jax.value_and_grad(lambda v, rows: ppo_loss(unravel(v), rows, net, distribution, config, clip), has_aux=True)
 
-        order = minibatches(key, rows, config.n_epochs, batch_size)
-        flat, opt_state, going, metrics = improve(flat, state.opt_state, batch, order, gradient, optimizer, rate, config.target_kl)
+        order = minibatches(key, items, config.n_epochs, per_minibatch)
+        flat, opt_state, going, metrics = improve(
+            flat, state.opt_state, batch, order, gradient, optimizer, rate, config.target_kl, sequences
+        )
+        metrics |= saturation(spec.action_space, rollout.action)
         metrics["train/explained_variance"] = explained_variance(batch.value, batch.target, batch.weight > 0)
         metrics["train/learning_rate"], metrics["train/clip_range"] = rate, clip
         if config.target_kl is not None:
@@ -236,7 +239,7 @@ def ppo(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) ->
     return Algorithm(
         init=init,
         actor=lambda state: state.params,
-        memory=lambda batch: (),
+        memory=lambda batch: fresh_memory(net, batch),
         draw=lambda key, steps: distribution.draw(key, (steps, spec.num_envs)),
         act=act,
         greedy=greedy,

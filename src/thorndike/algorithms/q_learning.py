@@ -209,15 +209,16 @@ def _learner(config: Config, sizes: tuple[int, int, int]) -> Callable[[Tables, I
         value = select(lax.dynamic_index_in_dim(tables.q, state, keepdims=False), column)
         target = _target(config, row, lax.dynamic_index_in_dim(tables.q, successor, keepdims=False))
         error = jnp.where(now.valid, target - value, 0.0)
-        rate, visits = row.rate, tables.visits
+        # What is not finite is reported but not learnt: the table stays good.
+        learnt, rate, visits = jnp.where(jnp.isfinite(error), error, 0.0), row.rate, tables.visits
         if config.visits_power > 0:
             count = select(lax.dynamic_index_in_dim(visits, state, keepdims=False), now.action) + now.valid
             visits = lax.dynamic_update_slice(visits, count[None, None], (state, now.action))
             rate = rate * jnp.maximum(count, 1).astype(jnp.float32) ** -config.visits_power
         if config.variant == "q_lambda":
-            q, traces = _trace(config, tables, row, rate * error, (first, seed * num_envs + row.env))
+            q, traces = _trace(config, tables, row, rate * learnt, (first, seed * num_envs + row.env))
             return Tables(q, visits, traces), jnp.abs(error)
-        q = lax.dynamic_update_slice(tables.q, (value + rate * error)[None, None], (state, column))
+        q = lax.dynamic_update_slice(tables.q, (value + rate * learnt)[None, None], (state, column))
         return Tables(q, visits, ()), jnp.abs(error)
 
     return learn_row

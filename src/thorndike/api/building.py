@@ -28,10 +28,10 @@ if TYPE_CHECKING:
 EnvironmentLike: TypeAlias = str | gymnasium.Env | Callable[..., gymnasium.Env] | gymnasium.vector.VectorEnv | Environment | Dynamics
 
 DEFAULT_STEPS = 100_000
-DEFAULT_NUM_ENVS = {"ppo": 8, "dqn": 4, "q_learning": 1}
+DEFAULT_NUM_ENVS = {"ppo": 8, "a2c": 8, "reinforce": 8, "dqn": 4, "q_learning": 1}
 LOG_POINTS = 100
 CHECKPOINTS = 10
-_WITH_NETWORK = ("ppo", "dqn")
+_WITH_NETWORK = ("ppo", "a2c", "reinforce", "dqn")
 
 
 class Request(NamedTuple):
@@ -76,12 +76,16 @@ def make(
     engine: str = "auto",
     env_kwargs: Mapping[str, object] | None = None,
     max_episode_steps: int | None = None,
+    env_timeout: float | None = None,
 ) -> Environment | HostEngine:
-    """The environments a run would train on: pure functions of a compiled engine, or a host engine to step from Python."""
+    """The environments a run would train on: pure functions of a compiled engine, or a host engine to step from Python.
+
+    ``env_timeout`` is how many seconds a step in a process of its own may take (60 by default); a reset may take twice that.
+    """
     choice = registry.resolve(environment, engine=engine, env_kwargs=env_kwargs, max_episode_steps=max_episode_steps)
     if choice.engine == "native":
         return registry.build_native(choice, num_envs)
-    return registry.build_host(choice, num_envs)
+    return registry.build_host(choice, num_envs, env_timeout=env_timeout)
 
 
 def check_algorithm(algorithm: str) -> None:
@@ -113,7 +117,7 @@ def build_algorithm(name: str, config: Mapping[str, object], spec: EnvSpec, netw
     if network is None:
         return factory(settings, spec)
     if name not in _WITH_NETWORK:
-        raise UserError(f"{name} has no network, so it takes none; {' and '.join(_WITH_NETWORK)} do")
+        raise UserError(f"{name} has no network, so it takes none; {', '.join(_WITH_NETWORK)} do")
     return factory(settings, spec, network)
 
 
@@ -149,7 +153,13 @@ def full_request(
     )
 
 
-def build_job(request: Request, choice: registry.Choice, given: Sequence[Wrapper] | None, network: NetworkBuilder | None) -> Job:
+def build_job(
+    request: Request,
+    choice: registry.Choice,
+    given: Sequence[Wrapper] | None,
+    network: NetworkBuilder | None,
+    env_timeout: float | None = None,
+) -> Job:
     """Bind a request to its environment, learner, source and runner."""
     wrapper = wrappers.from_settings(request.wrappers) if given is None else wrappers.chain(*given)
     indices = range(request.seeds)
@@ -159,7 +169,9 @@ def build_job(request: Request, choice: registry.Choice, given: Sequence[Wrapper
         source: Source | HostSource = compiled_source(environment, algorithm, wrapper)
         spec, close = environment.spec, _nothing
     else:
-        engine = registry.build_host(choice, request.num_envs * request.seeds)
+        engine = registry.build_host(
+            choice, request.num_envs * request.seeds, masks=request.algorithm in _WITH_NETWORK, env_timeout=env_timeout
+        )
         spec, close = engine.spec._replace(num_envs=request.num_envs), engine.close
         algorithm, plan = _learner(request, spec, wrapper, network)
         source = host_source(engine, algorithm, wrapper, request.seed, indices, plan.checkpoint_every)

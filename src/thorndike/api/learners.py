@@ -90,9 +90,11 @@ class Learner:
             self._policy = load(self.result.run, environment=self._environment, network=self._network)
         return self._policy
 
-    def predict(self, obs: PyTree, memory: PyTree = None, deterministic: bool = True) -> tuple[np.ndarray, PyTree]:
+    def predict(
+        self, obs: PyTree, memory: PyTree = None, deterministic: bool = True, action_mask: np.ndarray | None = None
+    ) -> tuple[np.ndarray, PyTree]:
         """Action for one observation or a batch, and the memory to pass with the next."""
-        return self.policy.predict(obs, memory, deterministic)
+        return self.policy.predict(obs, memory, deterministic, action_mask)
 
     def evaluate(self, episodes: int = 100, seed: int = 0) -> Evaluation:
         """Run every seed on fresh reference environments."""
@@ -103,6 +105,18 @@ class PPO(Learner):
     """Proximal policy optimisation."""
 
     algorithm = "ppo"
+
+
+class A2C(Learner):
+    """Advantage actor-critic."""
+
+    algorithm = "a2c"
+
+
+class REINFORCE(Learner):
+    """REINFORCE, with or without a baseline."""
+
+    algorithm = "reinforce"
 
 
 class DQN(Learner):

@@ -12,10 +12,12 @@ import jax.numpy as jnp
 from thorndike.api.building import EnvironmentLike, build_algorithm
 from thorndike.api.exporting import POLICY_FORMAT
 from thorndike.environments import registry
+from thorndike.environments.host.action_masks import mask_in_observation
 from thorndike.environments.host.gymnasium_engine import LoopEngine
 from thorndike.environments.origins import limit_of
 from thorndike.environments.wrappers import from_settings
 from thorndike.errors import UserError
+from thorndike.networks.masking import has_mask
 from thorndike.training.evaluation import Evaluation, evaluate
 from thorndike.training.policy import Policy
 from thorndike.training.run_directory import append_lines, intact
@@ -55,10 +57,10 @@ class LoadedPolicy:
         An environment without a time limit gets one of ``LONGEST_EPISODE`` steps.
         """
         choice = self._choice()
-        limit = choice.max_episode_steps
+        make, limit = self._maker(choice), choice.max_episode_steps
 
         def build(number: int) -> LoopEngine:
-            return LoopEngine([partial(registry.reference, choice)] * number, choice.id, limit)
+            return LoopEngine([make] * number, choice.id, limit)
 
         found = evaluate(self._policy, build, episodes, seed, num_envs or 20, deterministic)
         if self.run is not None:
@@ -71,7 +73,11 @@ class LoadedPolicy:
     def watch(self, path: str | Path | None = None, episodes: int = 1, seed: int = 0) -> Path | None:
         """Film episodes of the policy as mp4, or show them in a window if no path is given."""
         choice = self._choice()
-        return film(self._policy, partial(registry.reference, choice), None if path is None else Path(path), episodes, seed)
+        return film(self._policy, self._maker(choice), None if path is None else Path(path), episodes, seed)
+
+    def _maker(self, choice: registry.Choice) -> Callable[..., gymnasium.Env]:
+        make = partial(registry.reference, choice)
+        return mask_in_observation(make) if has_mask(self._policy.spec.observation_space) else make
 
     def _choice(self) -> registry.Choice:
         if self._environment is None and self.facts["environment_object"]:

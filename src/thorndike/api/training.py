@@ -42,6 +42,7 @@ def train(
     wrappers: Sequence[Wrapper] | None = None,
     network: NetworkBuilder | None = None,
     env_kwargs: Mapping[str, object] | None = None,
+    env_timeout: float | None = None,
     progress: bool = False,
     command: str | None = None,
 ) -> Result:
@@ -49,7 +50,8 @@ def train(
 
     ``steps`` are environment steps of each seed. What is not given comes from the environment's preset, then from the algorithm's
     defaults; ``preset="none"`` ignores presets. ``wrappers`` are those of ``thorndike.environments.wrappers``; ``network`` builds a
-    network of your own. Raises ``UserError`` for anything that cannot be.
+    network of your own. ``env_timeout`` is how many seconds a step of an environment in a process of its own may take (60 by default), a
+    reset twice that. Raises ``UserError`` for anything that cannot be.
     """
     check_algorithm(algorithm)
     if not 0 <= seed < 2**32 or seeds < 1:
@@ -60,7 +62,7 @@ def train(
     found = find_preset(algorithm, choice.id, preset)
     request = full_request(algorithm, choice, found, wrappers, settings or {}, steps, num_envs, seeds, seed, checkpoint_every)
     backend = startup.choose_device(device, is_large(algorithm, choice))
-    job = build_job(request, choice, wrappers, network)
+    job = build_job(request, choice, wrappers, network, env_timeout)
     run = new_run_directory(output, choice.id, algorithm, name)
     objects = {"network": "user" if network else "default", "environment_object": not isinstance(environment, str)}
     record = {**facts(), "status": "running", "command": command, "device": backend, **objects, **_as_json(request)}
@@ -74,6 +76,7 @@ def resume(
     environment: EnvironmentLike | None = None,
     wrappers: Sequence[Wrapper] | None = None,
     network: NetworkBuilder | None = None,
+    env_timeout: float | None = None,
     progress: bool = False,
 ) -> Result:
     """Go on with an interrupted run from its last checkpoint, or train a finished one further, to ``steps`` in all.
@@ -97,7 +100,7 @@ def resume(
         env_kwargs=request.env_kwargs,
         max_episode_steps=request.max_episode_steps,
     )
-    job = build_job(request, choice, wrappers, network)
+    job = build_job(request, choice, wrappers, network, env_timeout)
     return _conduct(run, {**record, **_as_json(request), "status": "running"}, job, progress, fresh=False)
 
 

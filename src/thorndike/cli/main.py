@@ -25,6 +25,8 @@ VERBS: dict[str, Verb] = {
     "eval": Verb("thorndike.cli.evaluate", "RUN", "score a trained policy on fresh reference environments"),
     "watch": Verb("thorndike.cli.watch", "RUN", "film a trained policy as mp4, or show it in a window"),
     "plot": Verb("thorndike.cli.plot", "RUN...", "draw learning curves with their 95 % interval"),
+    "compare": Verb("thorndike.cli.compare", "RUN RUN...", "say which run is better, worse, or that nobody can tell yet"),
+    "check-env": Verb("thorndike.cli.check_env", "ENVIRONMENT", "say what is wrong with an environment, with fixes"),
     "list": Verb("thorndike.cli.list", "[WHAT]", "list runs, algorithms, environments, presets or settings"),
     "show": Verb("thorndike.cli.show", "RUN", "show a run's settings, state and last results"),
     "info": Verb("thorndike.cli.info", "", "show versions, devices and optional packages"),
@@ -43,9 +45,11 @@ examples:
   thorndike train ppo CartPole-v1 --seeds 8        train eight agents at once
   thorndike train q_learning FrozenLake-v1         learn a table
   thorndike train ppo my_module:MyEnv-v0           your own Gymnasium environment
+  thorndike check-env my_module:MyEnv-v0           what is wrong with it
   thorndike eval latest --episodes 100             score the newest run
   thorndike watch latest                           see it act
   thorndike plot latest                            draw its learning curve
+  thorndike compare ppo-run dqn-run                which is better, and how sure is that
 
 A RUN is a run's directory, a part of its name that only it has, or `latest`.
 `thorndike VERB --help` tells more. `thorndike --version` prints the version."""

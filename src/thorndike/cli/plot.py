@@ -8,7 +8,8 @@ from thorndike.cli.answer import Answer
 from thorndike.cli.find_run import add_run_arguments, find_run
 from thorndike.cli.parser import Parser
 from thorndike.errors import UserError
-from thorndike.plotting.learning_curve import FORMATS, METRIC, plot_learning_curves, read_curve
+from thorndike.plotting.learning_curve import METRIC, plot_learning_curves, read_curve
+from thorndike.plotting.style import FORMATS
 
 EXAMPLES = """\
   thorndike plot latest

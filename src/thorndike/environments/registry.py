@@ -28,11 +28,13 @@ if TYPE_CHECKING:
     from gymnasium.vector import VectorEnv
 
     from thorndike.environments.host.envpool_engine import EnvPoolEngine
-    from thorndike.environments.host.gymnasium_engine import LoopEngine, VectorEngine
+    from thorndike.environments.host.gymnasium_engine import LoopEngine
+    from thorndike.environments.host.subprocess_engine import SubprocessEngine
+    from thorndike.environments.host.vector_engine import VectorEngine
     from thorndike.environments.native.vectorize import Dynamics
     from thorndike.types import Environment
 
-    HostEngine: TypeAlias = LoopEngine | VectorEngine | EnvPoolEngine
+    HostEngine: TypeAlias = LoopEngine | SubprocessEngine | VectorEngine | EnvPoolEngine
     Named: TypeAlias = str | gymnasium.Env | Callable[..., gymnasium.Env] | VectorEnv | Environment | Dynamics
 
 ENGINES = ("auto", "native", "gymnasium", "subprocess", "envpool")
@@ -91,9 +93,16 @@ def build_native(choice: Choice, num_envs: int) -> "Environment":
     return choice.origin
 
 
-def build_host(choice: Choice, num_envs: int) -> "HostEngine":
-    """The host engine. Raises UserError if the engine is ``native``, or a VectorEnv was given with another number of environments."""
-    from thorndike.environments.host.gymnasium_engine import LoopEngine, VectorEngine, subprocess_engine
+def build_host(choice: Choice, num_envs: int, masks: bool = False, env_timeout: float | None = None) -> "HostEngine":
+    """The host engine; with ``masks``, action masks that the environment gives elsewhere are moved into its observations.
+
+    `env_timeout` is how many seconds a step in another process may take (60 by default), and half of what a reset may. Raises UserError if
+    the engine is ``native``, or a VectorEnv was given with another number of environments.
+    """
+    from thorndike.environments.host.faults import timeouts
+    from thorndike.environments.host.gymnasium_engine import LoopEngine
+    from thorndike.environments.host.subprocess_engine import SubprocessEngine
+    from thorndike.environments.host.vector_engine import VectorEngine
     from thorndike.environments.origins import VectorEnv, limit_of, make_single
 
     if choice.engine == "native":
@@ -103,13 +112,18 @@ def build_host(choice: Choice, num_envs: int) -> "HostEngine":
     if isinstance(choice.origin, VectorEnv):
         if choice.origin.num_envs != num_envs:
             raise UserError(f"{choice.id} is a vector of {choice.origin.num_envs} environments, not {num_envs}: set num_envs to that")
-        return VectorEngine(choice.origin, choice.id)
-    make = partial(make_single, choice.origin, choice.env_kwargs, choice.max_episode_steps)
+        return VectorEngine(choice.origin, choice.id, timeouts=timeouts(env_timeout))
+    make: Callable[..., gymnasium.Env] = partial(make_single, choice.origin, choice.env_kwargs, choice.max_episode_steps)
     probe = make()
     limit = limit_of(probe)
     probe.close()
-    build = subprocess_engine if choice.engine == "subprocess" else LoopEngine
-    return build([make] * num_envs, choice.id, limit)
+    if masks:
+        from thorndike.environments.host.action_masks import mask_in_observation
+
+        make = mask_in_observation(make)
+    if choice.engine == "subprocess":
+        return SubprocessEngine([make] * num_envs, choice.id, limit, timeouts(env_timeout))
+    return LoopEngine([make] * num_envs, choice.id, limit)
 
 
 def reference(choice: Choice, render_mode: str | None = None) -> "gymnasium.Env":

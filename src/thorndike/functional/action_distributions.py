@@ -34,7 +34,7 @@ class ActionDistribution(NamedTuple):
 
 
 def action_distribution(space: gymnasium.Space) -> ActionDistribution:
-    """The usual distribution for a space: categorical, several categoricals, or a diagonal Gaussian.
+    """The usual distribution for a space: categorical, several categoricals (MultiBinary: of two), or a diagonal Gaussian.
 
     Raises ``UserError`` for a space that has none.
     """
@@ -42,9 +42,23 @@ def action_distribution(space: gymnasium.Space) -> ActionDistribution:
         return categorical(int(space.n))
     if isinstance(space, gymnasium.spaces.MultiDiscrete) and space.nvec.ndim == 1:
         return multi_categorical(tuple(int(n) for n in space.nvec))
+    if isinstance(space, gymnasium.spaces.MultiBinary) and len(space.shape) == 1:
+        return multi_categorical((2,) * space.shape[0])
     if isinstance(space, gymnasium.spaces.Box) and len(space.shape) == 1 and np.issubdtype(space.dtype, np.floating):
         return diagonal_gaussian(space.shape[0])
-    raise UserError(f"actions may be Discrete, MultiDiscrete (one row) or Box (one row of floats); this environment has {space}")
+    raise UserError(
+        f"actions may be Discrete, MultiDiscrete or MultiBinary (one row), or Box (one row of floats); this environment has {space}"
+    )
+
+
+def saturation(space: gymnasium.Space, action: Shaped[Array, "..."]) -> dict[str, Float[Array, ""]]:
+    """``rollout/action_saturation``: the share of a Box's action numbers beyond [-1, 1], which the environment's bounds clip.
+
+    Near 1 the policy pushes against its bounds all the time. Nothing for other spaces.
+    """
+    if not isinstance(space, gymnasium.spaces.Box):
+        return {}
+    return {"rollout/action_saturation": jnp.mean((jnp.abs(action) > 1.0).astype(jnp.float32))}
 
 
 def categorical(n: int) -> ActionDistribution:

@@ -16,9 +16,14 @@ class Choice(NamedTuple):
 
 
 def epsilon_greedy(
-    q: Float[Array, "*batch actions"], epsilon: Float[Array, "#*batch"], uniform: Float[Array, "*batch"], *, random_ties: bool = True
+    q: Float[Array, "*batch actions"],
+    epsilon: Float[Array, "#*batch"],
+    uniform: Float[Array, "*batch"],
+    *,
+    random_ties: bool = True,
+    allowed: Bool[Array, "*batch actions"] | None = None,
 ) -> Choice:
-    """A random action with probability `epsilon`, else one of the highest value.
+    """A random action with probability `epsilon`, else one of the highest value. `allowed`, if given, bounds the random ones.
 
     One number `uniform` in [0, 1) a row decides everything: below epsilon it explores, and its position inside its part, itself uniform,
     picks among the candidates. A float32 has 2**23 such numbers, so that with epsilon 0.01 and 10 actions the chance of each is exact to
@@ -28,7 +33,8 @@ def epsilon_greedy(
     low, width = jnp.where(explores, 0.0, epsilon), jnp.where(explores, epsilon, 1.0 - epsilon)
     position = (uniform - low) / jnp.where(width > 0.0, width, 1.0)
     best = q >= q.max(axis=-1, keepdims=True)
-    candidates = jnp.expand_dims(explores, -1) | best
+    at_random = jnp.expand_dims(explores, -1) if allowed is None else jnp.expand_dims(explores, -1) & allowed
+    candidates = at_random | best
     rank = _running_count(candidates)
     draw = jnp.floor(position * rank[..., -1]).astype(jnp.int32)
     # Rounding may carry a position just below 1 up to the count itself.

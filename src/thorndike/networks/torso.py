@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from thorndike.errors import UserError
+from thorndike.networks.masking import observed, without_mask
 from thorndike.types import Observation
 
 ACTIVATIONS: dict[str, Callable[[Array], Array]] = {"tanh": nn.tanh, "relu": nn.relu, "gelu": nn.gelu, "silu": nn.silu}
@@ -66,8 +67,9 @@ class Torso(nn.Module):
     @nn.compact
     def __call__(self, obs: Observation) -> Float[Array, "B G"]:
         """Observation ``[B, ...]`` to features ``[B, G]``."""
-        if not is_image(self.space):
-            return MLP(self.hidden, self.activation, self.kernel_init)(flatten_observation(self.space, obs))
+        space, obs = without_mask(self.space), observed(self.space, obs)
+        if not is_image(space):
+            return MLP(self.hidden, self.activation, self.kernel_init)(flatten_observation(space, obs))
         # A trailing axis turns a grey image [B, H, W] into [B, H, W, 1].
         image = obs if obs.ndim == 4 else obs[..., None]
         scaled = image.astype(jnp.float32) / (255.0 if image.dtype == jnp.uint8 else 1.0)
@@ -81,6 +83,7 @@ def example_observation(space: gymnasium.Space) -> Observation:
 
 def is_image(space: gymnasium.Space) -> bool:
     """Whether observations are images: a Box of uint8 ``[H, W]`` or ``[H, W, C]``, or of floats with a small channel axis."""
+    space = without_mask(space)
     if not isinstance(space, gymnasium.spaces.Box):
         return False
     return len(space.shape) == 3 or (len(space.shape) == 2 and space.dtype == np.uint8)

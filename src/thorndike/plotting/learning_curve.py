@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thorndike.errors import UserError
+from thorndike.plotting.style import COLOURS, STYLE, check_plot_file, counted, save_figure, short_number
 from thorndike.statistics.estimates import mean_interval_over_seeds
 from thorndike.suggestions import did_you_mean
 
@@ -19,31 +20,12 @@ if TYPE_CHECKING:
 Floats: TypeAlias = NDArray[np.float64]
 
 METRIC = "rollout/ep_rew_mean"
-FORMATS = (".png", ".svg", ".pdf")
 
-# Wong 2011, Nature Methods 8, 441: told apart by colour-blind readers too.
-_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 _TITLES = {
     "rollout/ep_rew_mean": "mean return of training episodes",
     "rollout/ep_len_mean": "mean length of training episodes (steps)",
     "eval/mean_reward": "mean return of evaluation episodes",
     "time/fps": "steps per second",
-}
-_STYLE = {
-    "font.size": 10.0,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.edgecolor": "#888888",
-    "axes.axisbelow": True,
-    "axes.grid": True,
-    "grid.color": "#E4E4E4",
-    "grid.linewidth": 0.8,
-    "xtick.color": "#555555",
-    "ytick.color": "#555555",
-    "axes.labelcolor": "#222222",
-    "legend.frameon": False,
-    "savefig.dpi": 150,
-    "svg.hashsalt": "thorndike",
 }
 
 
@@ -91,17 +73,11 @@ def plot_learning_curves(curves: Sequence[Curve], path: Path, *, metric: str = M
 
     The ending of `path` chooses the format. Raises UserError for another ending, or if Matplotlib is not installed.
     """
-    if path.suffix.lower() not in FORMATS:
-        raise UserError(f"a plot is written as {', '.join(FORMATS)}; got '{path.name}'")
-    try:
-        from matplotlib import style
-    except ModuleNotFoundError:
-        raise UserError("drawing needs Matplotlib: pip install 'thorndike[plot]'") from None
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with style.context(_STYLE):
-        figure = _draw(curves, metric, title)
-        figure.savefig(path, metadata={"Date": None} if path.suffix.lower() == ".svg" else None)
-    return path
+    check_plot_file(path)
+    from matplotlib import style
+
+    with style.context(STYLE):
+        return save_figure(_draw(curves, metric, title), path)
 
 
 def carried_forward(values: Floats) -> Floats:
@@ -119,7 +95,7 @@ def labels(curves: Sequence[Curve]) -> list[str]:
     environments = {curve.environment for curve in curves}
     names = [f"{curve.algorithm}" + (f" on {curve.environment}" if len(environments) > 1 else "") for curve in curves]
     told_apart = [f"{name} ({curve.name})" if names.count(name) > 1 else name for name, curve in zip(names, curves, strict=True)]
-    return [f"{name}, {_count(curve.values.shape[1], 'seed')}" for name, curve in zip(told_apart, curves, strict=True)]
+    return [f"{name}, {counted(curve.values.shape[1], 'seed')}" for name, curve in zip(told_apart, curves, strict=True)]
 
 
 def _draw(curves: Sequence[Curve], metric: str, title: str | None) -> "Figure":
@@ -128,11 +104,11 @@ def _draw(curves: Sequence[Curve], metric: str, title: str | None) -> "Figure":
     figure = Figure(figsize=(7.0, 4.2), layout="constrained")
     axes = figure.add_subplot()
     for index, (curve, label) in enumerate(zip(curves, labels(curves), strict=True)):
-        _draw_one(axes, curve, label, _COLOURS[index % len(_COLOURS)], each_seed=len(curves) == 1)
+        _draw_one(axes, curve, label, COLOURS[index % len(COLOURS)], each_seed=len(curves) == 1)
     axes.set_xlabel("environment steps of each seed")
     axes.set_ylabel(_TITLES.get(metric, metric))
     axes.set_xlim(left=0)
-    axes.xaxis.set_major_formatter(lambda steps, _: _short(steps))
+    axes.xaxis.set_major_formatter(lambda steps, _: short_number(steps))
     axes.set_title(title or " and ".join(dict.fromkeys(curve.environment for curve in curves)), loc="left", fontweight="bold")
     axes.legend(loc="best")
     if any(curve.values.shape[1] > 1 for curve in curves):
@@ -149,14 +125,3 @@ def _draw_one(axes: "Axes", curve: Curve, label: str, colour: str, each_seed: bo
         axes.plot(curve.steps, values, color=colour, alpha=0.25, linewidth=0.6)
     marker = "o" if len(curve.steps) == 1 else ""
     axes.plot(curve.steps, mean, color=colour, linewidth=1.8, marker=marker, label=label)
-
-
-def _short(number: float) -> str:
-    for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
-        if abs(number) >= size:
-            return f"{number / size:g}{letter}"
-    return f"{number:g}"
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}" + ("" if number == 1 else "s")

@@ -7,14 +7,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key, PyTree
 
 from thorndike.functional.returns import n_step_return
-from thorndike.types import Action, EnvSpec, Observation, Rollout
+from thorndike.types import Action, EnvSpec, Observation, Rollout, Step
 
 
 class ReplayBuffer(NamedTuple):
     """The ring. Rows ``[N, B]`` are stored flat, ``[N * B, ...]``, row ``t * B + b``."""
 
     rows: PyTree
-    """obs, action, reward, next_obs, terminated, done, valid: ``[N * B, ...]``."""
+    """obs, action, reward, next_obs, terminated, done, valid, and the memory an action was chosen with: ``[N * B, ...]``."""
     position: Int[Array, ""]
     """The step written next, in ``[0, N)``."""
     size: Int[Array, ""]
@@ -35,14 +35,16 @@ class Transitions(NamedTuple):
     """1, or 0 for a row that is no transition."""
 
 
-def row_shapes(spec: EnvSpec) -> PyTree:
-    """One stored transition of an environment, as shapes and dtypes."""
+def row_shapes(spec: EnvSpec, memory: PyTree = ()) -> PyTree:
+    """One stored transition of an environment, as shapes and dtypes; ``memory`` is a recurrent state of one environment ``[1, ...]``."""
     obs, action = (
         jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, jnp.asarray(x).dtype), space.sample())
         for space in (spec.observation_space, spec.action_space)
     )
     flag, number = jax.ShapeDtypeStruct((), jnp.bool_), jax.ShapeDtypeStruct((), jnp.float32)
-    return {"obs": obs, "action": action, "reward": number, "next_obs": obs, "terminated": flag, "done": flag, "valid": flag}
+    remembered = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), memory)
+    row = {"obs": obs, "action": action, "reward": number, "next_obs": obs, "terminated": flag, "done": flag, "valid": flag}
+    return row | {"memory": remembered}
 
 
 def init_replay(row: PyTree, steps: int, num_envs: int) -> ReplayBuffer:
@@ -62,6 +64,7 @@ def rows_of(rollout: Rollout) -> PyTree:
         "terminated": step.terminated,
         "done": step.done,
         "valid": step.valid,
+        "memory": rollout.extras["memory"] if isinstance(rollout.extras, dict) and "memory" in rollout.extras else (),
     }
 
 
@@ -90,18 +93,12 @@ def sample(buffer: ReplayBuffer, key: Key[Array, ""], batch_size: int, num_envs:
     not stored yet.
     """
     total = jax.tree.leaves(buffer.rows)[0].shape[0]
-    steps = total // num_envs
-    newest_allowed = jnp.maximum(buffer.size - (n_step - 1), 1)
-    oldest = buffer.position - buffer.size
-    # A remainder of 32 random bits is biased by less than size / 2**32, and costs a third of randint's rejection-free draw.
-    bits = jax.random.bits(key, (batch_size,), jnp.uint32)
-    drawn = (bits % (newest_allowed * num_envs).astype(jnp.uint32)).astype(jnp.int32)
-    index = (oldest * num_envs + drawn) % total
+    index = _draw(buffer, key, batch_size, num_envs, n_step)
     if n_step == 1:
         row = jax.tree.map(lambda x: x[index], buffer.rows)
         discount = jnp.where(row["terminated"], 0.0, gamma)
         return Transitions(row["obs"], row["action"], row["reward"], row["next_obs"], discount, row["valid"].astype(jnp.float32))
-    window = (index[None, :] + num_envs * jnp.arange(n_step, dtype=jnp.int32)[:, None]) % (steps * num_envs)
+    window = (index[None, :] + num_envs * jnp.arange(n_step, dtype=jnp.int32)[:, None]) % total
     reward, discount, last = n_step_return(
         buffer.rows["reward"][window], buffer.rows["terminated"][window], buffer.rows["done"][window], gamma
     )
@@ -109,3 +106,36 @@ def sample(buffer: ReplayBuffer, key: Key[Array, ""], batch_size: int, num_envs:
     first = {name: jax.tree.map(lambda x: x[index], buffer.rows[name]) for name in ("obs", "action", "valid")}
     next_obs = jax.tree.map(lambda x: x[ending], buffer.rows["next_obs"])
     return Transitions(first["obs"], first["action"], reward, next_obs, discount, first["valid"].astype(jnp.float32))
+
+
+def sample_sequences(buffer: ReplayBuffer, key: Key[Array, ""], count: int, length: int, num_envs: int) -> Rollout:
+    """Draw ``count`` sequences of ``length`` consecutive steps of one environment each, as a rollout ``[T, M, ...]``. Consumes the key.
+
+    Its memory is the one its first action was chosen with, as stored (Kapturowski et al. 2019, "stored state").
+    """
+    total = jax.tree.leaves(buffer.rows)[0].shape[0]
+    first = _draw(buffer, key, count, num_envs, length)
+    window = (first[None, :] + num_envs * jnp.arange(length, dtype=jnp.int32)[:, None]) % total
+    row = jax.tree.map(lambda x: x[window], {name: rows for name, rows in buffer.rows.items() if name != "memory"})
+    step = Step(
+        obs=row["next_obs"],
+        next_obs=row["next_obs"],
+        reward=row["reward"],
+        cost=jnp.zeros_like(row["reward"]),
+        terminated=row["terminated"],
+        truncated=row["done"] & ~row["terminated"],
+        valid=row["valid"],
+    )
+    memory = jax.tree.map(lambda x: x[first], buffer.rows["memory"])
+    return Rollout(row["obs"], row["action"], {}, step, memory)
+
+
+def _draw(buffer: ReplayBuffer, key: Key[Array, ""], count: int, num_envs: int, follow: int) -> Int[Array, " {count}"]:
+    """Rows after which ``follow - 1`` more steps of their environment are stored."""
+    total = jax.tree.leaves(buffer.rows)[0].shape[0]
+    newest_allowed = jnp.maximum(buffer.size - (follow - 1), 1)
+    oldest = buffer.position - buffer.size
+    # A remainder of 32 random bits is biased by less than size / 2**32, and costs a third of randint's rejection-free draw.
+    bits = jax.random.bits(key, (count,), jnp.uint32)
+    drawn = (bits % (newest_allowed * num_envs).astype(jnp.uint32)).astype(jnp.int32)
+    return (oldest * num_envs + drawn) % total

@@ -38,7 +38,7 @@ def interquartile_mean(scores: ArrayLike) -> float:
     Any shape: runs and tasks are pooled, as in rliable (``scipy.stats.trim_mean(scores, 0.25, axis=None)``).
     Source: Agarwal et al. 2021, Deep RL at the Edge of the Statistical Precipice, arXiv 2108.13264.
     """
-    return float(_pooled_iqm(_finite(scores).reshape(1, -1, 1))[0])
+    return float(pooled_iqm(finite_scores(scores).reshape(1, -1, 1))[0])
 
 
 def stratified_bootstrap_interval(
@@ -54,16 +54,23 @@ def stratified_bootstrap_interval(
     Stratified: every task's runs are drawn again on their own. The same seed gives the same interval.
     Below about ten runs such intervals are too narrow (Agarwal et al. 2021, A.5). Raises UserError for scores that are empty or not finite.
     """
-    table = _finite(scores)
+    return percentile_interval(bootstrap_values(scores, pooled_iqm if statistic is None else statistic, resamples, seed), confidence)
+
+
+def bootstrap_values(scores: ArrayLike, statistic: Statistic, resamples: int = RESAMPLES, seed: int = 0) -> Floats:
+    """The statistic of each of ``resamples`` stratified resamples of ``scores [runs]`` or ``[runs, tasks]``.
+
+    Raises UserError for scores that are empty or not finite.
+    """
+    table = finite_scores(scores)
     table = table.reshape(len(table), -1)
-    compute = _pooled_iqm if statistic is None else statistic
     generator = np.random.default_rng(seed)
     chunk = max(1, _CELLS_AT_ONCE // table.size)
     values: list[Floats] = []
     for start in range(0, resamples, chunk):
         rows = generator.integers(len(table), size=(min(chunk, resamples - start), *table.shape))
-        values.append(compute(table[rows, np.arange(table.shape[1])]))
-    return _percentiles(np.concatenate(values), confidence)
+        values.append(statistic(table[rows, np.arange(table.shape[1])]))
+    return np.concatenate(values)
 
 
 def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
@@ -88,11 +95,11 @@ def summary(scores: ArrayLike, *, resamples: int = RESAMPLES, seed: int = 0) -> 
     A seed counts once, by the mean of its episodes: episodes of one policy say nothing about the next training run.
     Raises UserError for scores that are empty or not finite.
     """
-    table = _finite(scores)
+    table = finite_scores(scores)
     table = table.reshape(len(table), -1)
     seeds = table.mean(axis=1)
     sample = table[0] if len(seeds) == 1 else seeds
-    mean_interval = stratified_bootstrap_interval(sample, _plain_mean, resamples=resamples, seed=seed)
+    mean_interval = stratified_bootstrap_interval(sample, plain_mean, resamples=resamples, seed=seed)
     iqm_interval = stratified_bootstrap_interval(sample, resamples=resamples, seed=seed)
     per_seed = tuple(map(float, seeds))
     return Summary(float(seeds.mean()), interquartile_mean(seeds), min(per_seed), max(per_seed), mean_interval, iqm_interval, per_seed)
@@ -118,22 +125,26 @@ def mean_interval_over_seeds(values: ArrayLike, *, resamples: int = 2_000, seed:
     return mean, low, high
 
 
-def _pooled_iqm(tables: Floats) -> Floats:
+def pooled_iqm(tables: Floats) -> Floats:
+    """The interquartile mean of each table ``[tables, runs, tasks]``, runs and tasks pooled."""
     ordered = np.sort(tables.reshape(len(tables), -1), axis=1)
     cut = ordered.shape[1] // 4
     return ordered[:, cut : ordered.shape[1] - cut].mean(axis=1)
 
 
-def _plain_mean(tables: Floats) -> Floats:
+def plain_mean(tables: Floats) -> Floats:
+    """The mean of each table ``[tables, runs, tasks]``."""
     return tables.reshape(len(tables), -1).mean(axis=1)
 
 
-def _percentiles(values: Floats, confidence: float) -> tuple[float, float]:
+def percentile_interval(values: Floats, confidence: float = 0.95) -> tuple[float, float]:
+    """The two quantiles that hold the middle ``confidence`` of values."""
     low, high = np.quantile(values, [(1 - confidence) / 2, (1 + confidence) / 2])
     return float(low), float(high)
 
 
-def _finite(scores: ArrayLike) -> Floats:
+def finite_scores(scores: ArrayLike) -> Floats:
+    """Scores as an array. Raises UserError if there are none, or some are not finite."""
     table = np.asarray(scores, np.float64)
     if table.size == 0 or not np.isfinite(table).all():
         raise UserError(f"expected finite scores, at least one, got {table.size} of which {int(np.isfinite(table).sum())} are finite")

@@ -55,12 +55,15 @@ class Policy:
         actors, statistics = jax.tree.map(lambda x: x[seed : seed + 1], (self.actors, self.statistics))
         return Policy(self.algorithm, self.wrapper, self.spec, actors, statistics, 0, self.run, self.first + seed)
 
-    def predict(self, obs: Observation, memory: PyTree = None, deterministic: bool = True) -> tuple[np.ndarray, PyTree]:
+    def predict(
+        self, obs: Observation, memory: PyTree = None, deterministic: bool = True, action_mask: np.ndarray | None = None
+    ) -> tuple[np.ndarray, PyTree]:
         """Action for one observation, or for a batch of them, and the memory to pass with the next ones.
 
-        ``memory=None`` starts an episode. Raises ``UserError`` if the observation does not fit the policy's space.
+        ``memory=None`` starts an episode. ``action_mask`` is what the environment gave beside ``obs``, where it gives masks. Raises
+        ``UserError`` if the observation does not fit the policy's space.
         """
-        batch, single = self._as_batch(obs)
+        batch, single = self._as_batch(obs if action_mask is None else _with_mask(obs, action_mask))
         actor, statistics = self._agent
         if memory is None:
             size = jax.tree.leaves(batch)[0].shape[0]
@@ -126,6 +129,10 @@ def _from_start(space: gymnasium.Space, action: np.ndarray) -> np.ndarray:
     if isinstance(space, gymnasium.spaces.Discrete | gymnasium.spaces.MultiDiscrete):
         return action + np.asarray(space.start, action.dtype)
     return action
+
+
+def _with_mask(obs: Observation, mask: np.ndarray) -> Observation:
+    return {**(obs if isinstance(obs, dict) else {"observation": obs}), "action_mask": mask}
 
 
 def _batch_axes(space: gymnasium.Space, obs: Observation) -> int:

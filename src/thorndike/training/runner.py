@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key, PyTree, UInt32
 
 from thorndike.training.host_source import HostSource
-from thorndike.types import Algorithm, EpisodeStats, Source
+from thorndike.types import Algorithm, EpisodeStats, Rollout, Source
 
 _ROWS_OF_A_PAGE = 1_024
 _RUN_ONCE = {"xla_backend_optimization_level": 0}
@@ -63,6 +63,9 @@ class Runner(NamedTuple):
     init: Callable[[], Carry]
     advance: Callable[[Carry, int, int], tuple[Carry, Report]]
     """carry, first iteration, number of iterations -> carry, report. The carry given is consumed. Splits at the end of the warm-up."""
+    inspect: Callable[[Carry, int], Rollout] | None
+    """carry, iteration -> the rollout ``[S, T, B, ...]`` that this iteration will learn from; the carry is kept. None for host engines,
+    which check what they return as it comes."""
     steps_per_iteration: int
     """Environment steps an iteration makes for one seed."""
     compile_seconds: Callable[[], float]
@@ -108,7 +111,8 @@ def runner(algorithm: Algorithm, source: Source | HostSource, seed: int, indices
         carry, later = learning(carry, first + until, count - until)
         return carry, Report(later.metrics, jax.tree.map(jnp.add, report.episodes, later.episodes))
 
-    return Runner(init, advance, algorithm.needs.rollout_length * plain.spec.num_envs, lambda: spent.cpu, lambda: spent.wall)
+    inspect = _inspector(algorithm, plain) if plain.compiled else None
+    return Runner(init, advance, inspect, algorithm.needs.rollout_length * plain.spec.num_envs, lambda: spent.cpu, lambda: spent.wall)
 
 
 def over_seeds(function: Callable) -> Callable:
@@ -146,6 +150,22 @@ class _PageKeys(NamedTuple):
 
 def _page_keys(loop_key: Key[Array, ""], number: Int[Array, ""]) -> _PageKeys:
     return _PageKeys(*jax.random.split(jax.random.fold_in(loop_key, number)))
+
+
+def _inspector(algorithm: Algorithm, source: Source) -> Callable[[Carry, int], Rollout]:
+    """One iteration's rollout, collected again without learning."""
+    page = page_length(algorithm, source.spec.num_envs)
+
+    @jax.jit
+    def all_seeds(carry: Carry, iteration: Int[Array, ""]) -> Rollout:
+        def one(carry: Carry) -> Rollout:
+            noise = source.draw(_page_keys(carry.loop_key, iteration // page).draw, page)
+            now = jax.tree.map(lambda x: x[iteration % page], noise)
+            return source.collect(carry.source, algorithm.actor(carry.learner), now)[1]
+
+        return over_seeds(one)(carry)
+
+    return lambda carry, iteration: all_seeds(carry, np.int32(iteration))
 
 
 def _compiled_segment(

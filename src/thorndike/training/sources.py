@@ -40,7 +40,6 @@ class Emitted(NamedTuple):
     reward: Float[Array, "*batch"]
     terminated: Bool[Array, "*batch"]
     truncated: Bool[Array, "*batch"]
-    action_mask: Bool[Array, "*batch n"] | None
     finished_return: Float[Array, "*batch"]
     finished_length: Float[Array, "*batch"]
 
@@ -106,7 +105,6 @@ def compiled_source(environment: Environment, algorithm: Algorithm, wrapper: Wra
             step.reward,
             step.terminated,
             step.truncated,
-            step.action_mask,
             jnp.where(done, total, 0.0),
             jnp.where(done, steps, 0).astype(jnp.float32),
         )
@@ -134,7 +132,6 @@ def compiled_source(environment: Environment, algorithm: Algorithm, wrapper: Wra
             terminated=emitted.terminated,
             truncated=emitted.truncated,
             valid=jnp.ones(emitted.reward.shape, bool),
-            action_mask=emitted.action_mask,
         )
         rollout = Rollout(emitted.seen, emitted.action, emitted.extras, step, memory)
         stats = EpisodeStats(

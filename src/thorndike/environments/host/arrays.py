@@ -5,7 +5,7 @@ spaces become a dict or tuple of arrays. Actions: a Discrete action counts from 
 clipped to the space's bounds by the engine.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import gymnasium
@@ -36,26 +36,6 @@ def check_spaces(observation: gymnasium.Space, action: gymnasium.Space, name: st
         )
 
 
-def check_observation(space: gymnasium.Space, observation: "PyTree", name: str) -> None:
-    """Raises UserError in one line if an observation has not the keys and shapes its space says."""
-    match space:
-        case spaces.Dict():
-            if not isinstance(observation, Mapping) or set(observation) != set(space.keys()):
-                came = sorted(observation) if isinstance(observation, Mapping) else type(observation).__name__
-                raise UserError(
-                    f"{name} returned an observation of {came}, but its space has the keys {sorted(space.keys())}: make them agree"
-                )
-            for key, part in space.items():
-                check_observation(part, observation[key], f"{name} ({key})")
-        case spaces.Tuple():
-            for part, value in zip(space, observation, strict=True):
-                check_observation(part, value, name)
-        case _ if np.shape(observation) != space.shape:
-            raise UserError(
-                f"{name} returned an observation of shape {np.shape(observation)}, but its space says {space.shape}: make them agree"
-            )
-
-
 def array_dtype(dtype: np.dtype | type | None) -> np.dtype:
     """The dtype a learner sees for a space's dtype: float32, int32 or uint8."""
     kind = np.dtype(dtype or np.float32)
@@ -75,18 +55,6 @@ def allocator(space: gymnasium.Space, count: int) -> "Callable[[], PyTree]":
             return lambda: tuple(part() for part in members)
     shape, dtype = (count, *(space.shape or ())), array_dtype(space.dtype)
     return lambda: np.empty(shape, dtype)
-
-
-def write(arrays: "PyTree", row: int, observation: "PyTree") -> None:
-    """One environment's observation into row ``row``, in place."""
-    if isinstance(arrays, np.ndarray):
-        arrays[row] = observation
-    elif isinstance(arrays, dict):
-        for key, part in arrays.items():
-            write(part, row, observation[key])
-    else:
-        for part, value in zip(arrays, observation, strict=True):
-            write(part, row, value)
 
 
 def fresh_copy(space: gymnasium.Space, batch: "PyTree") -> "PyTree":

@@ -10,6 +10,7 @@ What EnvPool 1.2.5 does, and what this engine makes of it (each found by a test 
   depend on the limit (MiniGrid's do), EnvPool keeps it.
 * Its Box2D observation spaces have ``low = 1.2e-38`` where minus infinity is meant: Gymnasium's spaces are shown, or mended ones.
 * Its images are channels first: small-channel uint8 images are turned to height, width, channels.
+* It checks nothing it gives: what is not finite, an observation or a reward, is named in a UserError here, in the step where it is.
 
 Which ids mean the same task as Gymnasium's, and how that was found, is in ``envpool_ids.py``.
 """
@@ -26,6 +27,8 @@ import numpy as np
 from gymnasium import spaces
 
 from thorndike.environments.host.arrays import action_converter, check_seeds, check_spaces, fresh_copy, take, with_rows
+from thorndike.environments.host.checks import all_finite, finite_test, not_finite, reward_not_finite
+from thorndike.environments.host.faults import Fault, named, reset_name
 from thorndike.environments.host.steps import host_step
 from thorndike.errors import UserError
 from thorndike.types import EnvSpec, Observation, Step
@@ -66,6 +69,8 @@ class EnvPoolEngine:
             self._settings["max_episode_steps"] = limit if self._limit is None else limit + 1
         self._channels_first = own.channels_first
         self._convert = action_converter(action)
+        self._is_finite = finite_test(observation)
+        self._steps = 0
         self._threads = num_threads or min(num_envs, len(os.sched_getaffinity(0)))
         self._pool: GymnasiumEnvPool | None = None
 
@@ -84,10 +89,16 @@ class EnvPoolEngine:
             )
             observation, _ = pool.reset()
         self._pool = pool
-        return self._observed(observation)
+        obs = self._observed(observation)
+        self._check_finite(obs, reset_name(self._steps))
+        return obs
 
     def step(self, actions: np.ndarray) -> Step:
-        """One action each: ``int[B]``, ``int[B, K]`` or ``float[B, D]`` (clipped to the bounds) -> Step of fresh arrays ``[B, ...]``."""
+        """One action each: ``int[B]``, ``int[B, K]`` or ``float[B, D]`` (clipped to the bounds) -> Step of fresh arrays ``[B, ...]``.
+
+        Raises UserError if an observation or a reward is not finite.
+        """
+        self._steps += 1
         observation, reward, terminated, truncated, info = self._running_pool().step(self._convert(actions))
         valid = ~self._ended
         next_obs = self._observed(observation)
@@ -97,6 +108,11 @@ class EnvPoolEngine:
         obs, truncated = self._keep_limit(next_obs, terminated, truncated, valid)
         cost = np.where(valid, info.get("cost", 0), 0).astype(np.float32)
         reward = np.where(valid, reward, 0).astype(np.float32)
+        self._check_finite(next_obs, f"step {self._steps}")
+        if not all_finite(reward):
+            raise self._named(reward_not_finite(reward), f"step {self._steps}")
+        if obs is not next_obs:
+            self._check_finite(obs, reset_name(self._steps))
         return host_step(obs, next_obs, reward=reward, cost=cost, terminated=terminated, truncated=truncated, valid=valid)
 
     def render(self) -> np.ndarray | None:
@@ -121,6 +137,13 @@ class EnvPoolEngine:
             return next_obs, truncated
         fresh, _ = self._running_pool().reset(cut)
         return with_rows(next_obs, cut, self._observed(fresh)), truncated
+
+    def _check_finite(self, obs: Observation, when: str) -> None:
+        if not self._is_finite(obs):
+            raise self._named(not_finite(self.spec.observation_space, obs), when)
+
+    def _named(self, fault: Fault, when: str) -> UserError:
+        return named(fault, self.spec.id, "environment", self.spec.num_envs, when)
 
     def _observed(self, observation: Observation) -> Observation:
         if self._channels_first:

@@ -1,0 +1,1 @@
+"""What ``check-env`` looks at, one subject a file. Free of JAX."""

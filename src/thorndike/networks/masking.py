@@ -1,0 +1,107 @@
+"""Action masks: which actions are allowed now. They come in with the observation, as the entry ``action_mask`` of a Dict space.
+
+A mask is 1 where an action is allowed, with one entry an action (Discrete), or the entries of all components one after another
+(MultiDiscrete; MultiBinary counts as components of two). Huang and Ontanon 2020 (arXiv:2006.14171) show that setting the logits of
+forbidden actions to a very low number is a valid policy gradient. A mask that allows nothing, as some environments give after the last
+step, counts as one that allows everything.
+"""
+
+import gymnasium
+import jax.numpy as jnp
+import numpy as np
+from gymnasium import spaces
+from jaxtyping import Array, Bool, Float, PyTree
+
+from thorndike.errors import UserError
+from thorndike.networks.network import Network, Recurrence
+from thorndike.types import EnvSpec, Observation
+
+MASK = "action_mask"
+FORBIDDEN = -1e9
+"""In place of minus infinity, whose gradients are no numbers."""
+
+
+def has_mask(space: gymnasium.Space) -> bool:
+    """Whether observations of this space bring a mask."""
+    return isinstance(space, spaces.Dict) and MASK in space.spaces
+
+
+def without_mask(space: gymnasium.Space) -> gymnasium.Space:
+    """The space of what is really observed; where that is a single entry, that entry's own space."""
+    if not isinstance(space, spaces.Dict) or MASK not in space.spaces:
+        return space
+    rest = {name: part for name, part in space.spaces.items() if name != MASK}
+    return next(iter(rest.values())) if len(rest) == 1 else spaces.Dict(rest)
+
+
+def observed(space: gymnasium.Space, obs: Observation) -> Observation:
+    """The part of ``obs`` that ``without_mask(space)`` describes."""
+    if not has_mask(space):
+        return obs
+    rest = {name: part for name, part in obs.items() if name != MASK}
+    return next(iter(rest.values())) if len(rest) == 1 else rest
+
+
+def allowed(obs: Observation) -> Bool[Array, "*B n"]:
+    """The mask of an observation that has one."""
+    mask = obs[MASK].astype(bool)
+    return mask | ~jnp.any(mask, axis=-1, keepdims=True)
+
+
+def masked(network: Network, spec: EnvSpec) -> Network:
+    """The same network with the outputs of forbidden actions at ``FORBIDDEN``: Q-values, or the logits of a policy and its value.
+
+    Unchanged where the environment has no masks. Raises ``UserError`` if the mask does not fit the actions.
+    """
+    if not has_mask(spec.observation_space):
+        return network
+    sizes = _check_mask(spec)
+
+    def mask(outputs: PyTree, obs: Observation) -> PyTree:
+        if isinstance(outputs, tuple):
+            return hide(outputs[0], obs), *outputs[1:]
+        return hide(outputs, obs)
+
+    def hide(values: Float[Array, "*B n"], obs: Observation) -> Float[Array, "*B n"]:
+        parts = jnp.split(obs[MASK].astype(bool), np.cumsum(sizes)[:-1], axis=-1)
+        open_ = jnp.concatenate([part | ~jnp.any(part, axis=-1, keepdims=True) for part in parts], axis=-1)
+        return jnp.where(open_, values, FORBIDDEN)
+
+    def apply(params: PyTree, obs: Observation) -> PyTree:
+        return mask(network.apply(params, obs), obs)
+
+    if network.recurrence is None:
+        return network._replace(apply=apply)
+    inner = network.recurrence
+
+    def step(params: PyTree, memory: PyTree, obs: Observation) -> tuple[PyTree, PyTree]:
+        memory, outputs = inner.step(params, memory, obs)
+        return memory, mask(outputs, obs)
+
+    def unroll(params: PyTree, memory: PyTree, obs: Observation, begins: Bool[Array, "T B"]) -> tuple[PyTree, PyTree]:
+        memories, outputs = inner.unroll(params, memory, obs, begins)
+        return memories, mask(outputs, obs)
+
+    return Network(network.init, apply, Recurrence(inner.fresh, step, unroll))
+
+
+def _check_mask(spec: EnvSpec) -> list[int]:
+    """How many entries of the mask belong to each component of an action."""
+    actions, came = spec.action_space, _mask_space(spec.observation_space).shape
+    if isinstance(actions, spaces.Discrete):
+        sizes = [int(actions.n)]
+    elif isinstance(actions, spaces.MultiDiscrete) and actions.nvec.ndim == 1:
+        sizes = [int(n) for n in actions.nvec]
+    elif isinstance(actions, spaces.MultiBinary) and len(actions.shape) == 1:
+        sizes = [2] * actions.shape[0]
+    else:
+        raise UserError(f"action masks are for Discrete, MultiDiscrete and MultiBinary actions; {spec.id} has a mask and {actions}")
+    if came != (sum(sizes),):
+        raise UserError(f"the action_mask of {spec.id} has shape {came}, but {actions} needs ({sum(sizes)},): one entry an action")
+    return sizes
+
+
+def _mask_space(space: gymnasium.Space) -> gymnasium.Space:
+    if isinstance(space, spaces.Dict):
+        return space.spaces[MASK]
+    raise UserError(f"{space} brings no {MASK}: give a Dict space with that entry")
