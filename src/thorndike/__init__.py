@@ -15,6 +15,7 @@ startup.prepare()
 _PUBLIC = {
     "train": "thorndike.api",
     "resume": "thorndike.api",
+    "reproduce": "thorndike.api",
     "load": "thorndike.api",
     "runs": "thorndike.api",
     "Result": "thorndike.api",

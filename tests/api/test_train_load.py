@@ -18,7 +18,8 @@ from thorndike.environments.native import factory
 from thorndike.environments.native.vectorize import vectorize
 from thorndike.errors import UserError
 from thorndike.networks.network import Network
-from thorndike.training.run_directory import checkpoints, intact, read_run
+from thorndike.training.run_directory import checkpoints, read_run
+from thorndike.training.sealed_folders import intact
 from training import tiny_environments
 from training.tiny_environments import PPO_SETTINGS, Corridor, CountedFromThree, DictCorridor
 

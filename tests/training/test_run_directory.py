@@ -1,6 +1,8 @@
 """A run's directory: never overwritten, never half written, damage found."""
 
+import contextlib
 import json
+import os
 import re
 
 import pytest
@@ -10,14 +12,14 @@ from thorndike.training.run_directory import (
     append_lines,
     checkpoints,
     facts,
-    intact,
     new_run_directory,
-    publish,
+    read_lines,
     read_run,
-    seal,
+    refuse_if_gone,
     truncate_lines,
     write_json,
 )
+from training.faulty_disk import Dead, disk, dying_at, failing_at
 
 
 def test_every_run_gets_a_directory_of_its_own(tmp_path):
@@ -58,73 +60,82 @@ def test_the_facts_say_how_to_make_the_run_again():
     found = facts()
     assert {"thorndike", "jax", "jaxlib", "numpy", "gymnasium", "python"} <= set(found["versions"])
     assert {"platform", "git_commit", "created", "processors", "format"} <= set(found)
+    assert set(found["machine"]) == {"processor", "xla_flags", "self_test"}
 
 
 @pytest.mark.parametrize(
     ("text", "words"),
-    [(None, "is no run"), ("{half", "is damaged"), ('{"format": 99}', "has format 99"), ("{}", "has format None")],
+    [
+        (None, "is no run"),
+        (b"{half", "is damaged"),
+        (b'{"format": 99}', "has format 99"),
+        (b"{}", "has format None"),
+        (b"\xff\xfe\x00", "is damaged"),
+        (b"[]", "expected an object"),
+        (b"[" * 100_000, "nested too deeply"),
+        (b'{"a": ' * 100 + b"1" + b"}" * 100, "nested too deeply"),
+        (b'{"format": ' + b"1" * 5000 + b"}", "is damaged"),
+        (b'{"format": "' + b"1\\n" * 5000 + b'"}', "has format '1"),
+    ],
 )
 def test_what_is_no_run_is_named_in_one_line(tmp_path, text, words):
     if text is not None:
-        (tmp_path / "run.json").write_text(text)
+        (tmp_path / "run.json").write_bytes(text)
     with pytest.raises(UserError, match=words) as error:
         read_run(tmp_path)
-    assert "\n" not in str(error.value)
+    assert "\n" not in str(error.value) and len(str(error.value)) < 500
+
+
+@pytest.mark.parametrize("mode", [failing_at, dying_at])
+def test_whatever_call_fails_run_json_is_the_old_or_the_new_one(tmp_path, mode):
+    path = tmp_path / "run.json"
+    write_json(path, {"format": 1, "is": "old"})
+    with disk() as counted:
+        write_json(path, {"format": 1, "is": "old"})
+    for number in range(1, len(counted.made) + 1):
+        with disk(mode(number)), contextlib.suppress(OSError, Dead):
+            write_json(path, {"format": 1, "is": "new"})
+        assert read_run(tmp_path)["is"] in ("old", "new")
+    write_json(path, {"format": 1, "is": "last"})
+    assert read_run(tmp_path)["is"] == "last"
+
+
+def test_lines_are_appended_all_or_none(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    append_lines(path, [{"steps": 10}])
+    real_write = os.write
+
+    def fill_up(watched, name, arguments):
+        if name == "write":
+            real_write(arguments[0], bytes(arguments[1])[:5])
+            raise OSError(28, "No space left on device")
+
+    with disk(fill_up), pytest.raises(OSError, match="No space left"):
+        append_lines(path, [{"steps": 20}, {"steps": 30}])
+    assert read_lines(path) == [{"steps": 10}]
+    append_lines(path, [{"steps": 20}])
+    assert path.read_text() == '{"steps": 10}\n{"steps": 20}\n'
+
+
+def test_a_directory_that_is_gone_is_named(tmp_path):
+    refuse_if_gone(tmp_path)
+    with pytest.raises(UserError, match="run is gone, with all that was kept in it: training stopped"):
+        refuse_if_gone(tmp_path / "run")
 
 
 def test_lines_after_the_last_checkpoint_are_dropped_and_half_a_line_too(tmp_path):
     path = tmp_path / "metrics.jsonl"
     append_lines(path, [{"steps": 10}, {"steps": 20}])
     append_lines(path, [{"steps": 30}])
-    with path.open("a") as file:
-        file.write('{"steps": 1')
+    with path.open("ab") as file:
+        file.write(b'{"steps": NaN}\n[5]\n\xff\n{"steps": "5"}\n{"steps": 1')
     truncate_lines(path, 20)
     assert [json.loads(line) for line in path.read_text().splitlines()] == [{"steps": 10}, {"steps": 20}]
     truncate_lines(tmp_path / "none.jsonl", 20)
     assert not (tmp_path / "none.jsonl").exists()
 
 
-def damaged(folder):
-    (folder / "data").write_bytes(b"other")
-
-
-def shortened(folder):
-    (folder / "data").write_bytes(b"")
-
-
-def removed(folder):
-    (folder / "data").unlink()
-
-
-def without_manifest(folder):
-    (folder / "manifest.json").unlink()
-
-
-def with_a_damaged_manifest(folder):
-    (folder / "manifest.json").write_text('{"sha256"')
-
-
-@pytest.mark.parametrize("harm", [damaged, shortened, removed, without_manifest, with_a_damaged_manifest])
-def test_damage_is_found(tmp_path, harm):
-    (tmp_path / "data").write_bytes(b"some bytes")
-    seal(tmp_path)
-    assert intact(tmp_path)
-    harm(tmp_path)
-    assert not intact(tmp_path)
-
-
-def test_publishing_replaces_a_folder_as_a_whole(tmp_path):
-    for content in (b"old", b"new"):
-        aside = tmp_path / "partial"
-        aside.mkdir()
-        (aside / "data").write_bytes(content)
-        publish(aside, tmp_path / "policy")
-    assert (tmp_path / "policy" / "data").read_bytes() == b"new"
-    assert intact(tmp_path / "policy")
-    assert not (tmp_path / "partial").exists()
-
-
 def test_checkpoints_are_ordered_by_step_and_unfinished_ones_are_none(tmp_path):
-    for name in ("900", "1000", "partial", "20"):
+    for name in ("900", "1000", "partial", "20", "30.old", "40.damaged", "²"):
         (tmp_path / "checkpoints" / name).mkdir(parents=True)
     assert [path.name for path in checkpoints(tmp_path)] == ["20", "900", "1000"]

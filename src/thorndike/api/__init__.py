@@ -5,6 +5,7 @@ from thorndike.api.comparing import Comparison, compare
 from thorndike.api.learners import A2C, DQN, PPO, REINFORCE, Learner, QLearning
 from thorndike.api.loading import LoadedPolicy, load
 from thorndike.api.loading import evaluate_run as evaluate
+from thorndike.api.reproducing import Reproduction, reproduce
 from thorndike.api.training import resume, runs, train
 from thorndike.api.training_result import Result
 
@@ -17,11 +18,13 @@ __all__ = [
     "Learner",
     "LoadedPolicy",
     "QLearning",
+    "Reproduction",
     "Result",
     "compare",
     "evaluate",
     "load",
     "make",
+    "reproduce",
     "resume",
     "runs",
     "train",

@@ -192,7 +192,9 @@ def is_large(request_algorithm: str, choice: registry.Choice) -> bool:
 def _learner(request: Request, spec: EnvSpec, wrapper: Wrapper, network: NetworkBuilder | None) -> tuple[Algorithm, Plan]:
     algorithm = build_algorithm(request.algorithm, request.config, wrapper.spec(spec), network)
     per_iteration = algorithm.needs.rollout_length * request.num_envs
-    plan = Plan(*(max(1, math.ceil(n / per_iteration)) for n in (request.steps, request.log_every, request.checkpoint_every)))
+    lengths = (request.steps, request.log_every, request.checkpoint_every)
+    iterations, log_every, checkpoint_every = (max(1, math.ceil(n / per_iteration)) for n in lengths)
+    plan = Plan(iterations, log_every, checkpoint_every)
     if algorithm.needs.warmup_iterations >= plan.iterations:
         warmup = algorithm.needs.warmup_iterations * per_iteration
         raise UserError(f"{request.algorithm}: the first {warmup} steps only fill the memory, so {request.steps} steps would learn nothing")

@@ -1,8 +1,6 @@
 """The exported policy of a run: actors and normaliser statistics of every seed, and all it takes to rebuild them. No code."""
 
-import json
 import math
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,11 +9,12 @@ import jax
 from thorndike.api.building import Job
 from thorndike.environments.wrappers import exported
 from thorndike.training.host_source import HostSource
+from thorndike.training.json_files import as_bytes
 from thorndike.training.metrics import LogPoint
-from thorndike.training.run_directory import publish
 from thorndike.training.runner import Carry
+from thorndike.training.sealed_folders import NewFolder
 from thorndike.training.space_files import space_to_json
-from thorndike.training.tree_files import save_tree
+from thorndike.training.tree_files import write_tree
 
 POLICY_FORMAT = 1
 
@@ -48,13 +47,10 @@ def export_policy(run: Path, record: dict[str, object], job: Job, carry: Carry, 
 
 def write_policy(run: Path, arrays: dict, content: dict[str, object]) -> None:
     """Write arrays and description as the run's policy, replacing the one before."""
-    aside = run / "policy.partial"
-    if aside.exists():
-        shutil.rmtree(aside)
-    aside.mkdir()
-    save_tree(arrays, aside / "policy.safetensors")
-    (aside / "policy.json").write_text(json.dumps({"format": POLICY_FORMAT, **content}, indent=2) + "\n", encoding="utf-8")
-    publish(aside, run / "policy")
+    new = NewFolder(run / "policy.partial")
+    write_tree(arrays, new, "policy")
+    new.write("policy.json", as_bytes({"format": POLICY_FORMAT, **content}))
+    new.publish(run / "policy")
 
 
 def _best(points: Sequence[LogPoint], seeds: int) -> int:

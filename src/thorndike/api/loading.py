@@ -1,30 +1,25 @@
 """``load``: a trained policy from its run directory, to act with, evaluate and watch."""
 
-import json
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
 import gymnasium
-import jax
-import jax.numpy as jnp
 
-from thorndike.api.building import EnvironmentLike, build_algorithm
-from thorndike.api.exporting import POLICY_FORMAT
+from thorndike.api.building import EnvironmentLike
+from thorndike.api.policy_files import read_policy
+from thorndike.api.recorded_run import refuse_code
 from thorndike.environments import registry
 from thorndike.environments.host.action_masks import mask_in_observation
 from thorndike.environments.host.gymnasium_engine import LoopEngine
 from thorndike.environments.origins import limit_of
-from thorndike.environments.wrappers import from_settings
 from thorndike.errors import UserError
 from thorndike.networks.masking import has_mask
 from thorndike.training.evaluation import Evaluation, evaluate
 from thorndike.training.policy import Policy
-from thorndike.training.run_directory import append_lines, intact
-from thorndike.training.space_files import space_from_json
-from thorndike.training.tree_files import load_tree
+from thorndike.training.run_directory import append_lines
 from thorndike.training.video import film
-from thorndike.types import Algorithm, Environment, EnvSpec, Wrapper
+from thorndike.types import Environment
 
 LONGEST_EPISODE = 10_000
 """Steps after which evaluation cuts an episode of an environment that has no time limit of its own."""
@@ -82,6 +77,8 @@ class LoadedPolicy:
     def _choice(self) -> registry.Choice:
         if self._environment is None and self.facts["environment_object"]:
             raise UserError(f"{self.run} was trained on an environment object: load it with td.load(run, environment=...)")
+        if self._environment is None and self.run is not None:
+            refuse_code(self.run, self.facts["environment"])
         named: EnvironmentLike = self.facts["environment"] if self._environment is None else self._environment
         choice = registry.resolve(named, env_kwargs=self.facts["env_kwargs"], max_episode_steps=self.facts["max_episode_steps"])
         if choice.max_episode_steps is not None or isinstance(choice.origin, gymnasium.vector.VectorEnv | Environment):
@@ -100,38 +97,10 @@ def load(run: str | Path, *, environment: EnvironmentLike | None = None, network
     yet.
     """
     run = Path(run)
-    folder = run / "policy"
-    if not folder.is_dir() and (run / "policy.old").is_dir():
-        # A process killed between the two renames of an export leaves the policy before it there.
-        folder = run / "policy.old"
-    if not folder.is_dir():
-        raise UserError(
-            f"{run} has no trained policy: {'it has not reached its first checkpoint' if run.is_dir() else 'no such directory'}"
-        )
-    if not intact(folder):
-        raise UserError(f"the policy in {folder} is damaged: a file is not what its manifest says; resume the run to write it again")
-    facts = json.loads((folder / "policy.json").read_text(encoding="utf-8"))
-    if facts.get("format") != POLICY_FORMAT:
-        raise UserError(f"{folder} has format {facts.get('format')!r}; this version of thorndike reads format {POLICY_FORMAT}")
-    if facts["network"] == "user" and network is None:
-        raise UserError(f"{run} was trained with a network of your own: load it with td.load(run, network=...)")
-    wrapper = from_settings(facts["wrappers"])
-    observations, actions = space_from_json(facts["observation_space"]), space_from_json(facts["action_space"])
-    spec = EnvSpec(facts["environment"], observations, actions, num_envs=facts["num_envs"], max_episode_steps=facts["max_episode_steps"])
-    algorithm = build_algorithm(facts["algorithm"], facts["config"], wrapper.spec(spec), network)
-    stored = load_tree(_shapes(algorithm, wrapper, spec, facts["seeds"]), folder / "policy.safetensors")
-    policy = Policy(algorithm, wrapper, spec, stored["actor"], stored["statistics"], facts["best"], run)
+    policy, facts = read_policy(run, network)
     return LoadedPolicy(policy, facts, environment)
 
 
 def evaluate_run(run: str | Path, episodes: int = 100, seed: int = 0, deterministic: bool = True) -> Evaluation:
     """Evaluate every seed of a run on fresh reference environments: ``load(run).evaluate(...)``."""
     return load(run).evaluate(episodes, seed, deterministic=deterministic)
-
-
-def _shapes(algorithm: Algorithm, wrapper: Wrapper, spec: EnvSpec, seeds: int) -> dict:
-    def one(key: jax.Array) -> dict:
-        return {"actor": algorithm.actor(algorithm.init(key)), "statistics": wrapper.statistics(spec)}
-
-    single = jax.eval_shape(one, jax.random.key(0))
-    return jax.tree.map(lambda x: jax.ShapeDtypeStruct((seeds, *jnp.shape(x)), x.dtype), single)

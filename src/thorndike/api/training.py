@@ -2,24 +2,30 @@
 
 import json
 import math
-import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
 
 from thorndike import startup
 from thorndike.api.building import EnvironmentLike, Job, Request, build_job, check_algorithm, full_request, is_large
 from thorndike.api.exporting import export_policy
 from thorndike.api.planning import plan_run
+from thorndike.api.recorded_run import Objects, read_record, rebuild, request_in
 from thorndike.api.training_result import Result
 from thorndike.environments import registry
 from thorndike.errors import UserError
 from thorndike.networks.network import NetworkBuilder
-from thorndike.training.metrics import LogPoint
+from thorndike.training.checkpoints import restore, save_checkpoint
+from thorndike.training.faults import locate
+from thorndike.training.json_files import Json
+from thorndike.training.metrics import last_points
+from thorndike.training.notices import notice
 from thorndike.training.presets import find_preset
 from thorndike.training.progress import Progress
-from thorndike.training.run_directory import checkpoints, facts, intact, new_run_directory, read_run, write_json
-from thorndike.training.runner import Carry
-from thorndike.training.session import START, Outcome, Progressed, restore, run_session
+from thorndike.training.run_directory import checkpoints, facts, new_run_directory, truncate_lines, write_json
+from thorndike.training.run_lock import run_lock
+from thorndike.training.runner import Stopwatch
+from thorndike.training.session import RECENT, Keeping, NotFinite, Outcome, Start, run_session
 from thorndike.types import Wrapper
 
 
@@ -65,8 +71,10 @@ def train(
     job = build_job(request, choice, wrappers, network, env_timeout)
     run = new_run_directory(output, choice.id, algorithm, name)
     objects = {"network": "user" if network else "default", "environment_object": not isinstance(environment, str)}
-    record = {**facts(), "status": "running", "command": command, "device": backend, **objects, **_as_json(request)}
-    return _conduct(run, record, job, progress, fresh=True)
+    record = {**facts(), "status": "running", "command": command, "device": backend, **objects, **as_json(request)}
+    with closing(job), run_lock(run):
+        _begin_record(run, record)
+        return _conduct(run, record, job, progress, lambda: Start(job.runner.init()))
 
 
 def resume(
@@ -81,27 +89,23 @@ def resume(
 ) -> Result:
     """Go on with an interrupted run from its last checkpoint, or train a finished one further, to ``steps`` in all.
 
-    ``environment``, ``wrappers`` and ``network`` are needed again where they were Python objects. Raises ``UserError`` if the run cannot
-    go on.
+    A run that was stopped before its first checkpoint begins again. ``environment``, ``wrappers`` and ``network`` are needed again where
+    they were Python objects. Raises ``UserError`` if the run cannot go on, or another process is writing it.
     """
-    run = Path(run)
-    record = read_run(run)
-    if record["algorithm"] == "planning":
-        raise UserError(f"{run} is a plan: it is complete, there is nothing to resume")
-    _need_objects(run, record, environment, wrappers, network)
-    request = Request(**{field: record[field] for field in Request._fields})
-    if steps is not None:
-        request = request._replace(steps=steps)
-    processors = str(record["processors"])
-    record["device"] = startup.choose_device(record["device"], False, int(processors) if processors.isdigit() else None)
-    choice = registry.resolve(
-        request.environment if environment is None else environment,
-        engine=request.engine,
-        env_kwargs=request.env_kwargs,
-        max_episode_steps=request.max_episode_steps,
-    )
-    job = build_job(request, choice, wrappers, network, env_timeout)
-    return _conduct(run, {**record, **_as_json(request), "status": "running"}, job, progress, fresh=False)
+    run, objects = Path(run), Objects(environment, wrappers, network)
+    read_record(run)
+    with run_lock(run):
+        # Read again: the process that held the lock may have changed it.
+        record = read_record(run)
+        request = request_in(record, run, objects)
+        if steps is not None:
+            request = request._replace(steps=steps)
+        _need_checkpoint(run)
+        with closing(rebuild(record, request, run, objects, env_timeout)) as job:
+            start = _restored(run, job)
+            record = {**record, **as_json(request), "status": "running"}
+            _begin_record(run, record)
+            return _conduct(run, record, job, progress, lambda: start)
 
 
 def runs(output: str | Path = "runs") -> list[Path]:
@@ -109,37 +113,74 @@ def runs(output: str | Path = "runs") -> list[Path]:
     return sorted((path.parent for path in Path(output).glob("*/*/*/run.json")), key=lambda path: path.name)
 
 
-def _conduct(run: Path, record: dict[str, object], job: Job, progress: bool, fresh: bool) -> Result:
+def _conduct(run: Path, record: Json, job: Job, progress: bool, begin: Callable[[], Start]) -> Result:
     """Run the session; whatever happens, ``run.json`` says how it ended."""
-    write_json(run / "run.json", record)
-    wall_began, cpu_began = time.perf_counter(), time.process_time()
-
-    def export(carry: Carry, points: Sequence[LogPoint]) -> None:
-        export_policy(run, record, job, carry, points)
-
+    spent = Stopwatch()
+    spent.start()
+    per_iteration = job.runner.steps_per_iteration
+    keeping = Keeping(
+        save=lambda carry, progressed: save_checkpoint(run, carry, job.source, progressed, per_iteration, as_json(job.request)),
+        export=lambda carry, points: export_policy(run, record, job, carry, points),
+    )
     try:
-        carry, start = (job.runner.init(), START) if fresh else restore(run, job.runner, job.source)
-        with Progress(job.request.steps, progress, done_steps=start.iteration * job.runner.steps_per_iteration) as bar:
-            before = start._replace(
-                wall_s=start.wall_s + time.perf_counter() - wall_began, cpu_s=start.cpu_s + time.process_time() - cpu_began
-            )
-            outcome = run_session(run, job.runner, job.source, job.plan, carry, before, export, bar)
+        start = begin()
+        with Progress(job.request.steps, progress, done_steps=start.progressed.iteration * per_iteration) as bar:
+            spent.stop()
+            outcome = run_session(run, job.runner, job.source, job.plan, start.later(spent.wall, spent.cpu), keeping, bar)
+    except NotFinite as error:
+        _note(run, {**record, "status": "failed", "error": str(error)})
+        raise UserError(_explained(run, job, error)) from error
     except BaseException as error:
-        status = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
-        write_json(run / "run.json", {**record, "status": status, "error": f"{type(error).__name__}: {error}"})
+        status = "interrupted" if isinstance(error, KeyboardInterrupt | SystemExit) else "failed"
+        _note(run, {**record, "status": status, "error": f"{type(error).__name__}: {error}"})
         raise
-    finally:
-        job.close()
     result = _result(run, job, start, outcome)
     times = {"wall_s": outcome.wall_s, "cpu_s": outcome.cpu_s, "compile_s": result.compile_s, "steps_done": outcome.steps}
-    write_json(run / "run.json", {**record, "status": outcome.status, **times})
+    _note(run, {**record, "status": outcome.status, **times})
     return result
 
 
-def _result(run: Path, job: Job, start: Progressed, outcome: Outcome) -> Result:
+def _explained(run: Path, job: Job, error: NotFinite) -> str:
+    """The error, with the first culprit found again from the last checkpoint where the engine can repeat itself."""
+    if job.runner.inspect is None:
+        return str(error)
+    carry, first = job.runner.init(), 0
+    if checkpoints(run):
+        carry, progressed = restore(run, job.runner, job.source, as_json(job.request))
+        first = progressed.iteration
+    found = locate(run, job.runner, carry, first, error.steps // job.runner.steps_per_iteration)
+    return str(error) if found is None else f"{found}; training stopped, the last checkpoint is kept"
+
+
+def _begin_record(run: Path, record: Json) -> None:
+    try:
+        write_json(run / "run.json", record)
+    except OSError as error:
+        raise UserError(f"{run}/run.json cannot be written: {error.strerror}; make room, or choose another folder with --output") from error
+
+
+def _note(run: Path, record: Json) -> None:
+    """Write how a run stands, as far as the disk lets it: training is over, and its checkpoints say the same."""
+    try:
+        write_json(run / "run.json", record)
+    except OSError as error:
+        notice(f"{run}/run.json could not be written: {error.strerror}; it does not say how the run ended")
+
+
+def _restored(run: Path, job: Job) -> Start:
+    if not checkpoints(run):
+        notice(f"{run} was stopped before its first checkpoint: it begins again")
+        truncate_lines(run / "metrics.jsonl", 0)
+        return Start(job.runner.init())
+    carry, progressed = restore(run, job.runner, job.source, as_json(job.request))
+    return Start(carry, progressed, last_points(run, RECENT, job.request.seeds))
+
+
+def _result(run: Path, job: Job, start: Start, outcome: Outcome) -> Result:
     compile_s = job.runner.compile_seconds()
-    made = (outcome.steps - start.iteration * job.runner.steps_per_iteration) * job.request.seeds
-    wall, cpu = outcome.wall_s - start.wall_s, outcome.cpu_s - start.cpu_s
+    before = start.progressed
+    made = (outcome.steps - before.iteration * job.runner.steps_per_iteration) * job.request.seeds
+    wall, cpu = outcome.wall_s - before.wall_s, outcome.cpu_s - before.cpu_s
     returns = outcome.recent[-1].returns if outcome.recent else []
     return Result(
         run=run,
@@ -152,22 +193,17 @@ def _result(run: Path, job: Job, start: Progressed, outcome: Outcome) -> Result:
         steps_per_s=made / max(wall - job.runner.compile_wall_seconds(), 1e-9),
         steps_per_cpu_s=made / max(cpu - compile_s, 1e-9),
         mean_return=sum(returns) / len(returns) if returns else math.nan,
+        saved_steps=outcome.saved_steps,
+        signal=outcome.signal,
     )
 
 
-def _need_objects(
-    run: Path, record: dict, environment: object | None, wrappers: Sequence[Wrapper] | None, network: NetworkBuilder | None
-) -> None:
-    """Raises ``UserError`` if something that was a Python object is not given again, or there is nothing to go on from."""
-    if record["network"] == "user" and network is None:
-        raise UserError(f"{run} was trained with a network of your own; go on in Python: td.resume(run, network=...)")
-    if record["environment_object"] and environment is None:
-        raise UserError(f"{run} was trained on an environment object; go on with it in Python: td.resume(run, environment=...)")
-    if wrappers is None and not all(record["wrappers"]):
-        raise UserError(f"{run} was trained with wrappers that hold your own functions; go on in Python: td.resume(run, wrappers=[...])")
-    if not any(intact(folder) for folder in checkpoints(run)):
-        raise UserError(f"{run} has no intact checkpoint to go on from; train again, or lower --checkpoint-every")
+def _need_checkpoint(run: Path) -> None:
+    """Raises ``UserError`` if there were checkpoints (a policy was exported at one) and all have been removed."""
+    if (run / "policy").exists() and not checkpoints(run):
+        raise UserError(f"{run} has no intact checkpoint to go on from: they were removed; train again")
 
 
-def _as_json(request: Request) -> dict[str, object]:
+def as_json(request: Request) -> Json:
+    """A request as ``run.json`` keeps it."""
     return json.loads(json.dumps(request._asdict(), default=str))

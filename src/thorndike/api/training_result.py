@@ -22,3 +22,7 @@ class Result(NamedTuple):
     steps_per_cpu_s: float
     mean_return: float
     """Of the episodes that ended in the last log point, over all seeds; NaN if none did."""
+    saved_steps: int = 0
+    """What the newest checkpoint holds: a resumed run goes on from there."""
+    signal: int | None = None
+    """The signal that interrupted it."""

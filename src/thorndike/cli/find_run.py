@@ -1,12 +1,12 @@
 """From what a user calls a run to its directory. Reads JSON files only: listing runs must not wait for JAX."""
 
-import json
 import os
 from argparse import ArgumentParser
 from pathlib import Path
 
 from thorndike.errors import UserError
 from thorndike.suggestions import nearest
+from thorndike.training.json_files import parse_object, read_object
 
 FACTS = "run.json"
 
@@ -64,16 +64,10 @@ def find_run(text: str, output: Path) -> Path:
 
 def read_facts(run: Path) -> dict[str, object]:
     """What ``run.json`` says. Raises UserError if it is no JSON object."""
-    try:
-        facts = json.loads(run.joinpath(FACTS).read_text(encoding="utf-8"))
-    except json.JSONDecodeError as error:
-        raise UserError(f"{run}/{FACTS} is damaged: {error}") from None
-    if not isinstance(facts, dict):
-        raise UserError(f"{run}/{FACTS} is damaged: expected an object")
-    return facts
+    return read_object(run / FACTS)
 
 
 def last_row(path: Path) -> dict[str, object]:
     """The last complete line of a ``.jsonl`` file as an object; empty if there is none."""
-    lines = path.read_text(encoding="utf-8").split("\n")[:-1] if path.is_file() else []
-    return json.loads(lines[-1]) if lines else {}
+    lines = path.read_bytes().split(b"\n")[:-1] if path.is_file() else []
+    return parse_object(lines[-1], path) if lines else {}

@@ -2,6 +2,7 @@
 
 import importlib
 import os
+import signal
 import sys
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -9,6 +10,7 @@ from typing import NamedTuple
 from thorndike.cli.answer import Answer, as_json_text, show, stdout_for_the_answer_only
 from thorndike.errors import UserError
 from thorndike.suggestions import did_you_mean
+from thorndike.training.stopping import Terminated, leave, prompt_exit
 
 
 class Verb(NamedTuple):
@@ -22,6 +24,7 @@ class Verb(NamedTuple):
 VERBS: dict[str, Verb] = {
     "train": Verb("thorndike.cli.train", "ALGORITHM ENVIRONMENT", "train an agent, or several seeds of it at once"),
     "resume": Verb("thorndike.cli.resume", "RUN", "go on with a run that stopped, bit for bit, or for more steps"),
+    "reproduce": Verb("thorndike.cli.reproduce", "RUN", "make a run again and compare it, bit for bit"),
     "eval": Verb("thorndike.cli.evaluate", "RUN", "score a trained policy on fresh reference environments"),
     "watch": Verb("thorndike.cli.watch", "RUN", "film a trained policy as mp4, or show it in a window"),
     "plot": Verb("thorndike.cli.plot", "RUN...", "draw learning curves with their 95 % interval"),
@@ -56,15 +59,24 @@ A RUN is a run's directory, a part of its name that only it has, or `latest`.
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; the exit status: 0 done, 2 a user's mistake, 130 interrupted."""
+    """Run the command line; the exit status: 0 done, 2 a user's mistake, 130 interrupted, 143 terminated."""
     words = list(sys.argv[1:] if arguments is None else arguments)
+    with prompt_exit():
+        status = _answer(words)
+        if arguments is None and status > 128:
+            # Not through the interpreter's own end: what was interrupted may hang there, or crash.
+            leave(status)
+    return status
+
+
+def _answer(words: list[str]) -> int:
     try:
         return _run(words)
     except UserError as error:
         return _report(str(error), "--json" in words)
-    except KeyboardInterrupt:
-        print("thorndike: interrupted", file=sys.stderr)
-        return 130
+    except (KeyboardInterrupt, Terminated) as stopped:
+        print(f"thorndike: {'terminated' if isinstance(stopped, Terminated) else 'interrupted'}", file=sys.stderr)
+        return 128 + (signal.SIGTERM if isinstance(stopped, Terminated) else signal.SIGINT)
     except BrokenPipeError:
         # The reader (`| head`) has gone: keep Python from failing once more when it flushes stdout at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)

@@ -7,6 +7,7 @@ from thorndike.cli.answer import Answer
 from thorndike.cli.find_run import add_run_arguments, find_run
 from thorndike.cli.parser import Parser, positive_whole
 from thorndike.cli.train import trained
+from thorndike.training.run_lock import refuse_if_locked
 
 EXAMPLES = """\
   thorndike resume latest
@@ -21,6 +22,7 @@ def run(words: Sequence[str]) -> Answer:
     parser.add_argument("--steps", type=positive_whole, help="steps of each seed in all (default: as planned)")
     options = parser.parse(words)
     directory = find_run(options.run, options.output)
+    refuse_if_locked(directory)
     from thorndike.api import resume
 
     return trained(resume(directory, steps=options.steps, progress=not options.json))

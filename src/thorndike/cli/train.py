@@ -176,8 +176,7 @@ def trained(result: "Result") -> Answer:
     plan = result.run / "plan.txt"
     if plan.exists():
         return Answer(data, _planned(result, plan.read_text(encoding="utf-8")))
-    interrupted = result.status == "interrupted"
-    verb = "resume" if interrupted else "eval"
+    verb = "resume" if result.status == "interrupted" else "eval"
     seeds = "one seed" if result.seeds == 1 else f"each of {result.seeds} seeds"
     text = (
         f"{result.status}: {result.steps:,} steps of {seeds} in {result.wall_s:.1f} s ({result.cpu_s:.1f} CPU-s, "
@@ -186,7 +185,7 @@ def trained(result: "Result") -> Answer:
         f"run: {result.run}\n"
         f"next: thorndike {verb} {shlex.quote(str(result.run))}"
     )
-    return Answer(data, text, exit_status=130 if interrupted else 0)
+    return Answer(data, text, exit_status=128 + result.signal if result.signal else 0)
 
 
 def _planned(result: "Result", picture: str) -> str:

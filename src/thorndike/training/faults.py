@@ -11,9 +11,10 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+from safetensors.numpy import save_file
 
 from thorndike.training.runner import Carry, Runner
-from thorndike.training.tree_files import save_tree
+from thorndike.training.tree_files import named_arrays
 from thorndike.types import Rollout
 
 
@@ -81,6 +82,6 @@ def _dump(run: Path, rollout: Rollout, iteration: int, what: str) -> str:
     folder = run / "faults"
     folder.mkdir(exist_ok=True)
     file = folder / f"iteration-{iteration}.safetensors"
-    save_tree(rollout, file)
+    save_file(named_arrays(rollout), file)
     file.with_suffix(".json").write_text(json.dumps({"iteration": iteration, "what": what}), encoding="utf-8")
     return f"the batch is in {file}"

@@ -1,14 +1,18 @@
 """The log of a run: one JSON line a log point with the seed axis kept, and TensorBoard events beside it."""
 
 import time
+from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import jax
 import numpy as np
 
-from thorndike.training.run_directory import append_lines
+from thorndike.training.json_files import Json
+from thorndike.training.notices import notice
+from thorndike.training.run_directory import append_lines, read_lines, refuse_if_gone
 from thorndike.training.runner import Report
+from thorndike.training.sealed_folders import flush
 from thorndike.training.tensorboard import EventWriter
 
 
@@ -27,12 +31,17 @@ class LogPoint(NamedTuple):
 
 
 class MetricsLog:
-    """Appends log points to metrics.jsonl and the mean over seeds to a TensorBoard file."""
+    """Appends log points to metrics.jsonl and the mean over seeds to a TensorBoard file.
+
+    Lines that cannot be written (the disk is full) wait until they can; the TensorBoard file, which says nothing new, is given up.
+    """
 
     def __init__(self, run: Path, wall_before: float, cpu_before: float) -> None:
         """``*_before`` are the seconds spent by the sessions before this one."""
         self._path = run / "metrics.jsonl"
-        self._events = EventWriter(run)
+        self._unwritten: list[Json] = []
+        self._told = False
+        self._events = _event_writer(run)
         self._wall_before, self._cpu_before = wall_before, cpu_before
         self._wall_start, self._cpu_start = time.perf_counter(), time.process_time()
         self._last: tuple[int, float] | None = None
@@ -57,15 +66,49 @@ class MetricsLog:
         values["rollout/episodes"] = _numbers(episodes.episodes)
         point = LogPoint(steps, self.wall_s, self.cpu_s, values)
         fps = self._steps_per_second(point)
-        append_lines(self._path, [{"steps": steps, "wall_s": point.wall_s, "cpu_s": point.cpu_s, "time/fps": fps, **values}])
-        for name, numbers in values.items():
-            finite = [number for number in numbers if number is not None]
-            if finite:
-                self._events.scalar(name, float(np.mean(finite)), steps)
-        if fps is not None:
-            self._events.scalar("time/fps", fps, steps)
-        self._events.flush()
+        self._unwritten.append({"steps": steps, "wall_s": point.wall_s, "cpu_s": point.cpu_s, "time/fps": fps, **values})
+        try:
+            self._append()
+        except OSError as error:
+            self._tell(error)
+        self._mirror(point, fps)
         return point
+
+    def sync(self) -> None:
+        """Make all lines durable. Raises ``OSError`` if they cannot be written."""
+        self._append()
+        flush(self._path)
+
+    def _append(self) -> None:
+        append_lines(self._path, self._unwritten)
+        self._unwritten.clear()
+
+    def _tell(self, error: OSError) -> None:
+        refuse_if_gone(self._path.parent)
+        if not self._told:
+            notice(f"{self._path} cannot be written: {error.strerror}; training goes on, the lines are kept and written once they can be")
+        self._told = True
+
+    def _mirror(self, point: LogPoint, fps: float | None) -> None:
+        """The means over seeds, for TensorBoard."""
+        if self._events is None:
+            return
+        means = {name: [number for number in numbers if number is not None] for name, numbers in point.values.items()}
+        try:
+            for name, finite in [*means.items(), ("time/fps", [] if fps is None else [fps])]:
+                if finite:
+                    self._events.scalar(name, float(np.mean(finite)), point.steps)
+            self._events.flush()
+        except OSError as error:
+            notice(f"{self._events.path} cannot be written: {error.strerror}; training goes on without TensorBoard's file")
+            self._give_up_events()
+
+    def _give_up_events(self) -> None:
+        if self._events is not None:
+            # What it still holds in memory cannot be written either.
+            with suppress(OSError):
+                self._events.close()
+        self._events = None
 
     def _steps_per_second(self, point: LogPoint) -> float | None:
         """Steps of all seeds per second since the last log point."""
@@ -77,7 +120,28 @@ class MetricsLog:
 
     def close(self) -> None:
         """Close the event file."""
-        self._events.close()
+        self._give_up_events()
+
+
+def _event_writer(run: Path) -> EventWriter | None:
+    try:
+        return EventWriter(run)
+    except OSError as error:
+        notice(f"{run} cannot be written: {error.strerror}; training goes on without TensorBoard's file")
+        return None
+
+
+def last_points(run: Path, number: int, seeds: int) -> list[LogPoint]:
+    """The last log points of a run in which episodes ended."""
+    rows = [row for row in read_lines(run / "metrics.jsonl") if _is_point(row, seeds)]
+    lists = [{name: values for name, values in row.items() if isinstance(values, list)} for row in rows]
+    points = [LogPoint(int(cast(float, row["steps"])), 0.0, 0.0, values) for row, values in zip(rows, lists, strict=True)]
+    return [point for point in points if point.returns][-number:]
+
+
+def _is_point(row: Json, seeds: int) -> bool:
+    returns = row.get("rollout/ep_rew_mean")
+    return isinstance(returns, list) and len(returns) == seeds and all(value is None or type(value) in (int, float) for value in returns)
 
 
 def _numbers(values: np.ndarray) -> list[float | None]:

@@ -1,19 +1,21 @@
 """The directory of a run: what is written where, and nothing else. No other run is ever overwritten."""
 
-import hashlib
 import json
 import os
 import platform
 import re
-import shutil
 import subprocess
 import time
 from collections.abc import Iterable, Mapping
 from datetime import datetime
 from importlib import metadata
 from pathlib import Path
+from typing import cast
 
 from thorndike.errors import UserError
+from thorndike.training.json_files import Json, as_bytes, parse_object, quoted, read_object
+from thorndike.training.machine import machine
+from thorndike.training.sealed_folders import flush, write_all, write_durably
 
 FORMAT = 1
 _PACKAGES = ("thorndike", "jax", "jaxlib", "flax", "optax", "numpy", "gymnasium", "envpool", "ale-py", "mujoco")
@@ -39,102 +41,67 @@ def new_run_directory(output: str | Path, environment: str, algorithm: str, name
 
 def write_json(path: Path, content: Mapping[str, object]) -> None:
     """Write a JSON file aside, flush it to the disk and rename it, so that a reader never sees half of it."""
-    aside = path.with_name(path.name + ".partial")
-    with aside.open("w", encoding="utf-8") as file:
-        json.dump(content, file, indent=2)
-        file.write("\n")
-        file.flush()
-        os.fsync(file.fileno())
-    aside.replace(path)
+    _replace(path, as_bytes(content))
 
 
 def read_run(run: str | Path) -> dict:
     """The ``run.json`` of a run. Raises ``UserError`` if there is none, or one this version cannot read."""
     path = Path(run) / "run.json"
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_object(path)
     except FileNotFoundError:
         raise UserError(f"{run} is no run: it has no run.json; `thorndike list` shows the runs there are") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise UserError(f"{path} is damaged: {error}") from None
     if content.get("format") != FORMAT:
-        raise UserError(f"{run} has format {content.get('format')!r}; this version of thorndike reads format {FORMAT}")
+        raise UserError(f"{run} has format {quoted(content.get('format'))}; this version of thorndike reads format {FORMAT}")
     return content
 
 
+def refuse_if_gone(run: Path) -> None:
+    """Raises ``UserError`` if the run's directory is not there any more."""
+    if not run.is_dir():
+        raise UserError(f"{run} is gone, with all that was kept in it: training stopped; train again, and leave the directory where it is")
+
+
 def append_lines(path: Path, rows: Iterable[Mapping[str, object]]) -> None:
-    """Append JSON lines."""
-    with path.open("a", encoding="utf-8") as file:
-        file.writelines(json.dumps(row) + "\n" for row in rows)
+    """Append JSON lines, all or none: where they do not fit on the disk, the file is as it was before."""
+    data = b"".join(json.dumps(row).encode() + b"\n" for row in rows)
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
+    try:
+        size = os.fstat(descriptor).st_size
+        try:
+            write_all(descriptor, data)
+        except OSError:
+            os.ftruncate(descriptor, size)
+            raise
+    finally:
+        os.close(descriptor)
+
+
+def read_lines(path: Path) -> list[Json]:
+    """The objects of a ``.jsonl`` file that have a number of ``steps``; half a line, which a killed process leaves behind, is none."""
+    lines = path.read_bytes().split(b"\n") if path.exists() else []
+    return [row for row in map(_row, lines) if row is not None]
 
 
 def truncate_lines(path: Path, last_step: int) -> None:
     """Drop the JSON lines of later steps than ``last_step``: what an interrupted run logged after its last checkpoint."""
     if not path.exists():
         return
-    kept = [line for line in path.read_text(encoding="utf-8").splitlines() if _step_of(line) <= last_step]
-    aside = path.with_name(path.name + ".partial")
-    aside.write_text("".join(line + "\n" for line in kept), encoding="utf-8")
-    aside.replace(path)
-
-
-def _step_of(line: str) -> float:
-    try:
-        return json.loads(line)["steps"]
-    except (json.JSONDecodeError, KeyError):
-        # Half a line is what a killed process leaves behind.
-        return float("inf")
-
-
-def seal(folder: Path) -> None:
-    """Write ``manifest.json``: the sha256 of every other file in a folder."""
-    files = sorted(path for path in folder.iterdir() if path.name != "manifest.json")
-    write_json(folder / "manifest.json", {"sha256": {path.name: _sha256(path) for path in files}})
-
-
-def intact(folder: Path) -> bool:
-    """Whether a folder has a manifest and every file in it is as it was written."""
-    try:
-        hashes = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))["sha256"]
-        return all(_sha256(folder / name) == digest for name, digest in hashes.items())
-    except (OSError, ValueError, KeyError):
-        return False
+    content = path.read_bytes()
+    rows = [(line, _row(line)) for line in content.split(b"\n")]
+    kept = b"".join(line + b"\n" for line, row in rows if row is not None and cast(float, row["steps"]) <= last_step)
+    if kept != content:
+        _replace(path, kept)
 
 
 def checkpoints(run: Path) -> list[Path]:
     """The checkpoints of a run, oldest first."""
-    found = [path for path in (run / "checkpoints").glob("*") if path.name.isdigit()]
+    found = [path for path in (run / "checkpoints").glob("*") if path.name.isdecimal() and path.name.isascii()]
     return sorted(found, key=lambda path: int(path.name))
 
 
-def publish(aside: Path, final: Path) -> None:
-    """Seal a folder written aside, flush its files and rename it into place."""
-    seal(aside)
-    for path in aside.iterdir():
-        with path.open("rb") as file:
-            os.fsync(file.fileno())
-    old = final.with_name(final.name + ".old")
-    if old.exists():
-        shutil.rmtree(old)
-    if final.exists():
-        final.rename(old)
-    aside.rename(final)
-    flush_folder(final.parent)
-    if old.exists():
-        shutil.rmtree(old)
-
-
-def flush_folder(folder: Path) -> None:
-    """Make renames in a folder durable."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
 def facts() -> dict[str, object]:
-    """Versions, platform and commit: what one needs to know to make the run again."""
+    """Versions, machine and commit: what one needs to know to make the run again."""
     versions = {"python": platform.python_version()}
     for package in _PACKAGES:
         try:
@@ -147,6 +114,7 @@ def facts() -> dict[str, object]:
         "versions": versions,
         "platform": platform.platform(),
         "processors": os.environ.get("NPROC") or str(os.cpu_count()),
+        "machine": machine(),
         "git_commit": _git_commit(),
     }
 
@@ -160,5 +128,17 @@ def _git_commit() -> str | None:
     return answer.stdout.strip() or None
 
 
-def _sha256(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+def _row(line: bytes) -> Json | None:
+    try:
+        row = parse_object(line, "line")
+    except UserError:
+        return None
+    return row if type(row.get("steps")) in (int, float) else None
+
+
+def _replace(path: Path, data: bytes) -> None:
+    aside = path.with_name(path.name + ".partial")
+    aside.unlink(missing_ok=True)
+    write_durably(aside, data)
+    os.replace(aside, path)
+    flush(path.parent)

@@ -63,15 +63,15 @@ class Runner(NamedTuple):
     init: Callable[[], Carry]
     advance: Callable[[Carry, int, int], tuple[Carry, Report]]
     """carry, first iteration, number of iterations -> carry, report. The carry given is consumed. Splits at the end of the warm-up."""
-    inspect: Callable[[Carry, int], Rollout] | None
-    """carry, iteration -> the rollout ``[S, T, B, ...]`` that this iteration will learn from; the carry is kept. None for host engines,
-    which check what they return as it comes."""
     steps_per_iteration: int
     """Environment steps an iteration makes for one seed."""
     compile_seconds: Callable[[], float]
     """CPU seconds spent on compiling so far."""
     compile_wall_seconds: Callable[[], float]
     """The same by the clock on the wall."""
+    inspect: Callable[[Carry, int], Rollout] | None = None
+    """carry, iteration -> the rollout ``[S, T, B, ...]`` that this iteration will learn from; the carry is kept. None for host engines,
+    which check what they return as it comes."""
 
 
 def run_keys(seed: int, indices: UInt32[Array, " S"]) -> Key[Array, " S"]:
@@ -112,7 +112,8 @@ def runner(algorithm: Algorithm, source: Source | HostSource, seed: int, indices
         return carry, Report(later.metrics, jax.tree.map(jnp.add, report.episodes, later.episodes))
 
     inspect = _inspector(algorithm, plain) if plain.compiled else None
-    return Runner(init, advance, inspect, algorithm.needs.rollout_length * plain.spec.num_envs, lambda: spent.cpu, lambda: spent.wall)
+    per_iteration = algorithm.needs.rollout_length * plain.spec.num_envs
+    return Runner(init, advance, per_iteration, lambda: spent.cpu, lambda: spent.wall, inspect)
 
 
 def over_seeds(function: Callable) -> Callable:
