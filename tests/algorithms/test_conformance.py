@@ -14,10 +14,9 @@ from thorndike.environments import wrappers
 from thorndike.environments.native import factory
 from thorndike.environments.native.vectorize import vectorize
 from thorndike.training import runner as runner_module
+from thorndike.training.checkpoints import Progressed, restore, save_checkpoint
 from thorndike.training.run_directory import checkpoints
 from thorndike.training.runner import Carry, Runner, runner
-from thorndike.training.checkpoints import restore, save_checkpoint
-from thorndike.training.checkpoints import Progressed
 from thorndike.training.sources import compiled_source
 from thorndike.types import Algorithm, Source, Wrapper
 

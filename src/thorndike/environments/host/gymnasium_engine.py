@@ -18,6 +18,7 @@ from thorndike.environments.host.arrays import action_converter, allocator, chec
 from thorndike.environments.host.checks import (
     RESET_GIVES,
     STEP_GIVES,
+    all_finite,
     bounds_hold,
     check_flags,
     check_values,
@@ -28,13 +29,10 @@ from thorndike.environments.host.checks import (
     reward_not_finite,
     storer,
 )
-from thorndike.environments.host.faults import as_fault, named, reset_name
+from thorndike.environments.host.faults import Fault, as_fault, named, reset_name
 from thorndike.environments.host.steps import host_spec, host_step
 from thorndike.errors import UserError
 from thorndike.types import Observation, Step
-
-_SURELY_FINITE = 1e76
-"""A sum of squares below this has no term that float32 could not hold."""
 
 MakeEnv = Callable[[], gymnasium.Env]
 
@@ -68,11 +66,9 @@ class LoopEngine:
                 self._row = row
                 observation, _ = env.reset(seed=seed)
                 self._store(obs, row, observation)
-                check_values(self.spec.observation_space, observation, self._bounds)
         except Exception as error:
             raise self._named(error, reset_name(self._steps), RESET_GIVES) from error
-        if not self._is_finite(obs):
-            raise self._named(not_finite(self.spec.observation_space, obs), reset_name(self._steps))
+        self._check(obs, reset_name(self._steps), look=True)
         return obs
 
     def step(self, actions: np.ndarray) -> Step:
@@ -81,16 +77,17 @@ class LoopEngine:
         if len(actions) != count:
             raise ValueError(f"step needs one action for each of the {count} environments, not {len(actions)}")
         self._steps += 1
+        look = due(self._steps)
         next_obs, reward = self._allocate(), np.empty(count, np.float32)
         ended: list[tuple[int, bool, bool]] = []
         costs: list[tuple[int, float]] = []
         try:
-            squares = self._step_rows(actions, next_obs, reward, ended, costs)
+            self._step_rows(actions, next_obs, reward, ended, costs, look)
         except Exception as error:
             raise self._named(error, f"step {self._steps}") from error
-        if not self._is_finite(next_obs):
-            raise self._named(not_finite(self.spec.observation_space, next_obs), f"step {self._steps}")
-        if not squares < _SURELY_FINITE and not np.isfinite(reward).all():
+        if look or not self._is_finite(next_obs):
+            self._check(next_obs, f"step {self._steps}", look)
+        if not all_finite(reward):
             raise self._named(reward_not_finite(reward), f"step {self._steps}")
         obs, terminated, truncated, cost = next_obs, self._never, self._never, self._free
         if ended:
@@ -113,9 +110,10 @@ class LoopEngine:
         reward: np.ndarray,
         ended: list[tuple[int, bool, bool]],
         costs: list[tuple[int, float]],
-    ) -> float:
-        """One step of each environment into the arrays and lists; the sum of the rewards' squares, not finite if one is not."""
-        store, look, squares = self._store, due(self._steps), 0.0
+        look: bool,
+    ) -> None:
+        """One step of each environment into the arrays and lists; if `look`, with the checks that are not always made."""
+        store = self._store
         array, dtype, shape = self._exact
         for row, (step, action) in enumerate(zip(self._steppers, actions, strict=True)):
             self._row = row
@@ -126,17 +124,13 @@ class LoopEngine:
             else:
                 store(next_obs, row, observation)
             if look:
-                check_values(self.spec.observation_space, observation, self._bounds)
                 check_flags(dead, cut)
-            if type(pay) is not float:
                 pay = number(pay)
             reward[row] = pay
-            squares += pay * pay
             if dead or cut:
                 ended.append((row, dead, cut))
             if info and "cost" in info:
                 costs.append((row, info["cost"]))
-        return squares
 
     def _after_ends(self, next_obs: Observation, ended: list[tuple[int, bool, bool]]) -> tuple[Observation, np.ndarray, np.ndarray]:
         """Resets what ended: what the policy sees next, terminated, truncated."""
@@ -149,8 +143,18 @@ class LoopEngine:
         except Exception as error:
             raise self._named(error, reset_name(self._steps), RESET_GIVES) from error
         if not self._is_finite(obs):
-            raise self._named(not_finite(self.spec.observation_space, obs), reset_name(self._steps))
+            self._check(obs, reset_name(self._steps), look=False)
         return obs, terminated, truncated
+
+    def _check(self, obs: Observation, when: str, look: bool) -> None:
+        """Raises UserError for the first environment whose observation is not finite or, if `look`, not within its space."""
+        try:
+            if not self._is_finite(obs):
+                raise not_finite(self.spec.observation_space, obs)
+            if look:
+                check_values(self.spec.observation_space, obs, self._bounds)
+        except Fault as fault:
+            raise self._named(fault, when) from fault
 
     def _named(self, error: Exception, when: str, expected: str = STEP_GIVES) -> UserError:
         fault = as_fault(error, __file__, expected)

@@ -70,11 +70,9 @@ class VectorEngine:
         seeds = check_seeds(seeds, self.spec.num_envs)
         when = reset_name(self._steps)
         try:
-            observation = self._fresh(seeds)
-            obs = self._checked(observation)
+            obs = self._checked(self._fresh(seeds))
         except Exception as error:
             raise self._named(error, "(observations, infos)", when, self._timeouts.reset) from error
-        self._check_finite(obs, when)
         self._ended = np.zeros(self.spec.num_envs, np.bool_)
         return obs
 
@@ -86,8 +84,8 @@ class VectorEngine:
             step = self._stepped(actions)
         except Exception as error:
             raise self._named(error, _GIVES, f"step {self._steps}", self._timeouts.step) from error
-        self._check_finite(step.next_obs, f"step {self._steps}")
         if step.obs is not step.next_obs:
+            self._check_finite(step.next_obs, f"step {self._steps}")
             self._check_finite(step.obs, reset_name(self._steps))
         return step
 
@@ -125,8 +123,10 @@ class VectorEngine:
     def _checked(self, observation: Observation) -> Observation:
         """The batch as a learner sees it."""
         batch = checked_batch(self.spec.observation_space, observation, self.spec.num_envs)
-        for row in range(self.spec.num_envs) if due(self._steps) else ():
-            check_values(self.spec.observation_space, take(batch, np.array(row)), self._bounds, row)
+        if not self._is_finite(batch):
+            raise not_finite(self.spec.observation_space, batch)
+        if due(self._steps):
+            check_values(self.spec.observation_space, batch, self._bounds)
         return batch
 
     def _check_finite(self, obs: Observation, when: str) -> None:

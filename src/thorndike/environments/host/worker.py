@@ -88,10 +88,10 @@ class Worker:
 
     def _put(self, arrays: "Observation", observation: "Observation", look: bool) -> None:
         self._store(arrays, 0, observation)
-        if look:
-            check_values(self._space, observation, self._bounds)
         if not self._is_finite(arrays):
             raise not_finite(self._space, arrays)
+        if look:
+            check_values(self._space, arrays, self._bounds)
 
 
 def main() -> None:
