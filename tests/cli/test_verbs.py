@@ -100,7 +100,14 @@ def test_bench_measures_and_leaves_nothing_behind(tmp_path, capsys, monkeypatch)
 def test_settings_algorithms_presets_environments_and_info_are_listed(capsys):
     settings = answer(["list", "settings", "ppo"], capsys)["settings"]
     assert {"setting": "gamma", "default": "0.99", "value": "between 0 and 1", "meaning": "discount"} in settings
-    assert {row["algorithm"] for row in answer(["list", "algorithms"], capsys)["algorithms"]} == {"ppo", "dqn", "q_learning", "planning"}
+    assert {row["algorithm"] for row in answer(["list", "algorithms"], capsys)["algorithms"]} == {
+        "ppo",
+        "a2c",
+        "reinforce",
+        "dqn",
+        "q_learning",
+        "planning",
+    }
     assert "CartPole-v1" in answer(["list", "environments"], capsys)["native"]
     assert any(row["environment"] == "CartPole-v1" for row in answer(["list", "presets"], capsys)["presets"])
     assert answer(["info"], capsys)["packages"]["jax"]
