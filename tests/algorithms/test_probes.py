@@ -178,13 +178,13 @@ CASES = {
     "ppo": lambda: learn(DISCRETE, partial(ppo_for, 60), 60),
     "ppo, Box": lambda: learn(BOX, partial(ppo_for, 60, log_std_init=-2.0), 60),
     "a2c": lambda: learn(DISCRETE, partial(a2c_for, 600), 600),
-    "reinforce": lambda: learn(DISCRETE, partial(reinforce_for, 400), 400),
+    "reinforce": lambda: learn(DISCRETE, partial(reinforce_for, 800), 800),
     "dqn": lambda: learn(DISCRETE, partial(dqn_for, 1200), 1200),
     "q_learning": lambda: learn(DISCRETE, partial(table_for, 60, "q_learning"), 60, wrappers.discretise(3)),
 }
 SLOW_CASES = {
     "a2c, Box": lambda: learn(BOX, partial(a2c_for, 600, log_std_init=-2.0), 600),
-    "reinforce, Box": lambda: learn(BOX, partial(reinforce_for, 400, log_std_init=-2.0), 400),
+    "reinforce, Box": lambda: learn(BOX, partial(reinforce_for, 800, log_std_init=-2.0), 800),
     "dqn, double, dueling, 3 steps": lambda: learn(DISCRETE, partial(dqn_for, 1200, double=True, dueling=True, n_step=3), 1200),
     "sarsa": lambda: learn(DISCRETE, partial(table_for, 100, "sarsa"), 100, wrappers.discretise(3)),
     "expected sarsa": lambda: learn(DISCRETE, partial(table_for, 100, "expected_sarsa"), 100, wrappers.discretise(3)),

@@ -285,6 +285,11 @@ def test_a_pool_that_is_closed_or_forgotten_leaves_nothing():
         assert groups and left_of(groups) == []
 
 
+def test_workers_start_without_jax():
+    code = "import sys, thorndike.environments.host.worker; sys.exit('jax' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
 def test_actions_reach_workers_as_their_spaces_say():
     engine = SubprocessEngine([WideBoxEnv] * 2, "wide")
     engine.reset([0, 0])

@@ -64,16 +64,16 @@ class Chance:
 
 def test_a_run_killed_again_and_again_ends_as_one_that_nothing_happened_to(tmp_path, monkeypatch):
     settings = {"n_steps": 8, "batch_size": 16, "n_epochs": 2, "net_arch": (8,)}
-    request = {"steps": 24_000, "num_envs": 4, "settings": settings, "preset": "none", "checkpoint_every": 1600}
+    request = {"steps": 40_000, "num_envs": 4, "settings": settings, "preset": "none", "checkpoint_every": 1600}
     whole = td.train("ppo", "CartPole-v1", output=tmp_path / "whole", **request).run
-    words = ["train", "ppo", "CartPole-v1", "--steps=24k", "--num-envs=4", "--preset=none", "--checkpoint-every=1600"]
+    words = ["train", "ppo", "CartPole-v1", "--steps=40k", "--num-envs=4", "--preset=none", "--checkpoint-every=1600"]
     words += [f"--output={tmp_path / 'killed'}", *(f"--set={name}={value}" for name, value in (settings | {"net_arch": 8}).items())]
     monkeypatch.setattr("training.kill_and_resume.environment", quickly)
     for _ in range(2):
         run = run_below(tmp_path / "killed")
-        assert kill_at_random(words if run is None else ["resume", str(run)], tmp_path / "killed", Chance(0.5), 0.8)
+        assert kill_at_random(words if run is None else ["resume", str(run)], tmp_path / "killed", Chance(0.5), 0.4)
     run = run_below(tmp_path / "killed")
-    assert 0 < lines_of(run) < lines_of(whole)
+    assert 0 < lines_of(run) <= lines_of(whole)
     assert read_run(run)["status"] == "running"
     assert td.resume(run).status == "finished"
     assert difference(whole, run) is None
@@ -88,9 +88,9 @@ def test_runs_killed_at_fifty_random_moments_end_as_one_that_nothing_happened_to
     assert tally.differences == []
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGTERM])
 def test_a_signal_to_a_command_keeps_the_state_and_is_its_exit_status(tmp_path, number):
-    words = ["train", "q_learning", "FrozenLake-v1", "--steps", "200M", "--output", str(tmp_path), "--json"]
+    words = ["train", "q_learning", "FrozenLake-v1", "--steps", "40M", "--output", str(tmp_path), "--json"]
     process = subprocess.Popen(command(words), env=quickly(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     while not lines_of(run_below(tmp_path)) and process.poll() is None:
         time.sleep(0.01)

@@ -7,11 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from safetensors.numpy import load_file
 
 from thorndike.errors import UserError
 from thorndike.training import tree_files
 from thorndike.training.sealed_folders import Damaged, NewFolder, SealedFolder
-from thorndike.training.tree_files import read_arrays, read_tree, write_tree
+from thorndike.training.tree_files import read_arrays, read_tree, save_tree, write_tree
 
 
 class Pair(NamedTuple):
@@ -53,6 +54,13 @@ def test_a_tree_comes_back_bit_for_bit(tmp_path, monkeypatch, described, blocks)
     found = read_tree(jax.eval_shape(tree) if described else tree(), folder, "t")
     assert jax.tree.structure(found) == jax.tree.structure(tree())
     assert all(map(same, jax.tree.leaves(found), jax.tree.leaves(tree())))
+
+
+def test_a_tree_may_also_be_a_file_by_itself(tmp_path):
+    save_tree({"a": jnp.arange(3), "b": (jnp.float32(2),)}, tmp_path / "t.safetensors")
+    found = load_file(tmp_path / "t.safetensors")
+    assert sorted(found) == ["a", "b/0"]
+    np.testing.assert_array_equal(found["a"], [0, 1, 2])
 
 
 def test_a_single_array_has_a_name_too(tmp_path):

@@ -96,7 +96,7 @@ def build_native(choice: Choice, num_envs: int) -> "Environment":
 def build_host(choice: Choice, num_envs: int, masks: bool = False, env_timeout: float | None = None) -> "HostEngine":
     """The host engine; with ``masks``, action masks that the environment gives elsewhere are moved into its observations.
 
-    `env_timeout` is how many seconds a step in another process may take (60 by default), and half of what a reset may. Raises UserError if
+    `env_timeout` is how many seconds a step in another process may take (60 by default); a reset may take twice that. Raises UserError if
     the engine is ``native``, or a VectorEnv was given with another number of environments.
     """
     from thorndike.environments.host.faults import timeouts

@@ -65,9 +65,17 @@ def save_checkpoint(
 
 
 def restore(run: Path, runner: Runner, source: PyTree, request: Mapping[str, object] | None = None) -> tuple[Carry, Progressed]:
-    """The carry of the newest checkpoint that is as it was written, and where it stands. Later lines of the log are dropped.
+    """``load_checkpoint``, to go on from there: later lines of the log are dropped."""
+    carry, progressed = load_checkpoint(run, runner, source, request)
+    truncate_lines(run / "metrics.jsonl", progressed.iteration * runner.steps_per_iteration)
+    return carry, progressed
 
-    Of those that are damaged a notice tells. Raises ``UserError`` if there is no other, or ``request`` is not what it was made for.
+
+def load_checkpoint(run: Path, runner: Runner, source: PyTree, request: Mapping[str, object] | None = None) -> tuple[Carry, Progressed]:
+    """The carry of the newest checkpoint that is as it was written, and where it stands.
+
+    Those that are damaged are put aside, and a notice tells of them. Raises ``UserError`` if there is no other, or ``request`` is not what
+    it was made for.
     """
     fresh = runner.init()
 
@@ -79,7 +87,6 @@ def restore(run: Path, runner: Runner, source: PyTree, request: Mapping[str, obj
         return read_tree(restorable(fresh, source), folder, STATE), progressed
 
     stored, progressed = newest(run, read)
-    truncate_lines(run / "metrics.jsonl", progressed.iteration * runner.steps_per_iteration)
     if not isinstance(source, HostSource):
         return fresh._replace(learner=stored[0], source=stored[1]), progressed
     return fresh._replace(learner=stored[0], source=source.restart(stored[1], progressed.iteration)), progressed

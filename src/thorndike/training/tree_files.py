@@ -41,6 +41,11 @@ def write_tree(tree: PyTree, folder: NewFolder, name: str, *, blocks: bool = Fal
         folder.write(f"{name}.blocks.json", as_bytes({key: _write_blocks(array, folder, donor) for key, array in large.items()}))
 
 
+def save_tree(tree: PyTree, path: Path) -> None:
+    """Write every array of ``tree`` into one safetensors file by itself, outside any sealed folder."""
+    path.write_bytes(save(named_arrays(tree)))
+
+
 def read_tree(like: PyTree, folder: SealedFolder, name: str) -> PyTree:
     """Read a tree of the structure of ``like`` (arrays or shapes).
 
