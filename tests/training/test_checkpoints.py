@@ -44,7 +44,7 @@ def carry_at(iteration: int) -> Carry:
 
 
 def runner_of(carry: Carry) -> Runner:
-    return Runner(lambda: carry, None, None, PER_ITERATION, lambda: 0.0, lambda: 0.0)
+    return Runner(lambda: carry, None, PER_ITERATION, lambda: 0.0, lambda: 0.0)
 
 
 RUNNER = runner_of(carry_at(0))

@@ -37,7 +37,7 @@ class Counting:
         return carry + count, Report({"train/loss": numbers}, EpisodeStats(numbers, numbers, numbers, numbers))
 
     def runner(self) -> Runner:
-        return Runner(lambda: 0, self.advance, None, PER_ITERATION, lambda: 0.0, lambda: 0.0)
+        return Runner(lambda: 0, self.advance, PER_ITERATION, lambda: 0.0, lambda: 0.0)
 
 
 class Kept:
