@@ -16,11 +16,16 @@ from thorndike import startup
 
 startup.prepare()
 
+import signal
 from collections.abc import Iterator
 
 import jax
 import pytest
 from jaxtyping import install_import_hook
+
+# A shell starts what runs in its background deaf to Ctrl-C, and children inherit that.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 install_import_hook(["thorndike.functional", "thorndike.networks", "thorndike.replay"], "beartype.beartype")

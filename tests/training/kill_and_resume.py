@@ -3,12 +3,14 @@
     python tests/training/kill_and_resume.py --kills 50
 
 For each case (a learner, compiled or on host environments) a run is made that is not disturbed. Then runs with the same seed are killed,
-resumed, and killed again; when one has come to its end, its checkpoints, metrics and policy are compared with the first one's, bit for
-bit. One line a case; exit status 1 if anything differed.
+resumed, and killed again; after each kill every checkpoint there is compared with its manifest. When a run has come to its end, its
+checkpoints, metrics and policy are compared with the first one's, bit for bit. One line a case; exit status 1 if anything differed, or
+could not be read.
 """
 
 import argparse
 import json
+import math
 import os
 import random
 import shutil
@@ -18,6 +20,9 @@ import tempfile
 import time
 from pathlib import Path
 from typing import NamedTuple
+
+from thorndike.training.run_directory import checkpoints, read_lines, read_run
+from thorndike.training.sealed_folders import intact
 
 ROOT = Path(__file__).parents[2]
 TIMES = ("wall_s", "cpu_s", "time/fps")
@@ -55,6 +60,10 @@ class Tally(NamedTuple):
     """Kills that left a checkpoint half written."""
     runs: int
     differences: list[str]
+    unreadable: int
+    """Checkpoints that were not as their manifests say, after a kill."""
+    lost: float
+    """The most that was logged after the newest checkpoint when a run was killed, in intervals between checkpoints."""
 
 
 def command(words: list[str]) -> list[str]:
@@ -84,6 +93,19 @@ def finished(words: list[str]) -> None:
 def run_below(output: Path) -> Path | None:
     """The run in a folder, once it has a run.json."""
     return next((path.parent for path in output.glob("*/*/*/run.json")), None)
+
+
+def lost_steps(run: Path) -> int:
+    """Steps that were logged after the newest checkpoint: those that resume makes again."""
+    rows = read_lines(run / "metrics.jsonl")
+    return (rows[-1]["steps"] if rows else 0) - max((int(path.name) for path in checkpoints(run)), default=0)
+
+
+def interval_of(run: Path) -> int:
+    """Steps between two checkpoints: what was asked for, in whole iterations."""
+    newest = checkpoints(run)[-1]
+    per_iteration = int(newest.name) // json.loads((newest / "progress.json").read_text())["iteration"]
+    return math.ceil(read_run(run)["checkpoint_every"] / per_iteration) * per_iteration
 
 
 def lines_of(run: Path | None) -> int:
@@ -146,7 +168,7 @@ def try_case(case: Case, kills: int, chance: random.Random, folder: Path) -> Tal
     whole = run_below(folder / "whole")
     rows = [json.loads(line) for line in (whole / "metrics.jsonl").read_text().splitlines()]
     training_s = (rows[-1]["wall_s"] - rows[0]["wall_s"]) / (KILLS_OF_A_RUN - 1)
-    made, in_training, saving, runs, differences = 0, 0, 0, 0, []
+    made, in_training, saving, runs, unreadable, lost, differences = 0, 0, 0, 0, 0, 0, []
     while made < kills:
         output = folder / f"killed-{runs}"
         for _ in range(min(KILLS_OF_A_RUN, kills - made)):
@@ -159,6 +181,9 @@ def try_case(case: Case, kills: int, chance: random.Random, folder: Path) -> Tal
             saving += run is not None and (run / "checkpoints" / "partial").exists()
             if run is None:
                 shutil.rmtree(output, ignore_errors=True)
+                continue
+            unreadable += sum(not intact(path) for path in checkpoints(run))
+            lost = max(lost, lost_steps(run))
         run = run_below(output)
         finished(["resume", str(run)] if run is not None else [*train, "--output", str(output)])
         found = difference(whole, run_below(output))
@@ -166,7 +191,7 @@ def try_case(case: Case, kills: int, chance: random.Random, folder: Path) -> Tal
         runs += 1
         if found is None:
             shutil.rmtree(output)
-    return Tally(made, in_training, saving, runs, differences)
+    return Tally(made, in_training, saving, runs, differences, unreadable, lost / interval_of(whole))
 
 
 def main() -> int:
@@ -184,10 +209,11 @@ def main() -> int:
         began = time.monotonic()
         with tempfile.TemporaryDirectory(prefix="thorndike-kill-", dir=options.folder) as folder:
             tally = try_case(case, options.kills, random.Random(f"{options.seed} {case.name}"), Path(folder))
-        bad += len(tally.differences)
+        bad += len(tally.differences) + tally.unreadable
         print(
             f"{case.name}: {tally.kills} kills ({tally.in_training} in training, {tally.while_saving} while saving) of {tally.runs} runs, "
-            f"{len(tally.differences)} different, {time.monotonic() - began:.0f} s {'; '.join(tally.differences)}",
+            f"{len(tally.differences)} different, {tally.unreadable} unreadable checkpoints, at most {tally.lost:.2f} intervals lost, "
+            f"{time.monotonic() - began:.0f} s {'; '.join(tally.differences)}",
             flush=True,
         )
     return 1 if bad else 0

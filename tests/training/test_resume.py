@@ -86,6 +86,8 @@ def test_runs_killed_at_fifty_random_moments_end_as_one_that_nothing_happened_to
     assert tally.kills == 50
     assert tally.in_training > 25
     assert tally.differences == []
+    assert tally.unreadable == 0
+    assert 0 < tally.lost <= 1
 
 
 @pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGTERM])
