@@ -17,6 +17,7 @@ from thorndike.environments.wrappers import (
     normalize_observation,
     normalize_reward,
     potential_shaping,
+    select_observation,
     shape_reward,
     wrap,
 )
@@ -294,6 +295,27 @@ def test_every_leaf_is_stacked_on_its_last_axis_and_the_space_agrees(space, shap
     assert shown_space["leaf"].shape == shape == shown["leaf"].shape[1:]
     assert shown_space["leaf"].contains(np.asarray(shown["leaf"][0], shown_space["leaf"].dtype))
     assert shown["leaf"].dtype == obs["leaf"].dtype or space.dtype == np.int64
+
+
+def test_only_the_selected_entries_are_shown_in_their_order():
+    wrapper = select_observation([1, 0])
+    space = wrapper.spec(make_spec(BOX)).observation_space
+    np.testing.assert_array_equal(space.high, [10, 1])
+    first, end = np.array([[0.5, 3.0]], np.float32), np.array([[-0.5, 4.0]], np.float32)
+    memory, shown = wrapper.init((), first)
+    np.testing.assert_array_equal(shown, [[3.0, 0.5]])
+    _, step = wrapper.step((), memory, first, np.zeros(1, np.int32), make_step(first, end, truncated=True))
+    np.testing.assert_array_equal(step.obs, [[3.0, 0.5]])
+    np.testing.assert_array_equal(step.next_obs, [[4.0, -0.5]])
+
+
+@pytest.mark.parametrize(
+    ("space", "entries", "words"),
+    [(BOX, [0, 2], "no entry 2; .* 0 to 1"), (BOX, [], "no entry was named"), (spaces.Discrete(3), [0], "a Box vector, not of Discrete")],
+)
+def test_entries_that_are_not_there_cannot_be_selected(space, entries, words):
+    with pytest.raises(UserError, match=words):
+        select_observation(entries).spec(make_spec(space))
 
 
 # composition

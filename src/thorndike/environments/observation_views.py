@@ -115,6 +115,18 @@ def stacked_space(space: gymnasium.Space, k: int) -> gymnasium.Space:
     raise UserError(f"frame_stack cannot stack {space}: give it Box, Discrete, MultiDiscrete or MultiBinary observations")
 
 
+def selected_space(space: gymnasium.Space, entries: Sequence[int]) -> gymnasium.Space:
+    """The space of some entries of a vector. Raises UserError if it is none, or has them not."""
+    if not isinstance(space, spaces.Box) or len(space.shape) != 1:
+        raise UserError(f"select_observation takes entries of a Box vector, not of {space}")
+    outside = [entry for entry in entries if not 0 <= entry < space.shape[0]]
+    if outside or not entries:
+        what = f"there is no entry {outside[0]}" if outside else "no entry was named"
+        raise UserError(f"select_observation: {what}; the observation has the entries 0 to {space.shape[0] - 1}")
+    chosen = np.asarray(entries)
+    return spaces.Box(space.low[chosen], space.high[chosen], dtype=space.dtype.type)
+
+
 def repeat_frame(leaf: Array, k: int) -> Array:
     """`k` copies of a frame ``[B, ...]`` on the last axis."""
     return jnp.concatenate([_with_axis(jnp.asarray(leaf))] * k, axis=-1)

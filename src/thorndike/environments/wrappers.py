@@ -36,6 +36,7 @@ from thorndike.environments.observation_views import (
     on_floats,
     push_frame,
     repeat_frame,
+    selected_space,
     space_leaves,
     stacked_space,
 )
@@ -175,6 +176,23 @@ def frame_stack(k: int) -> Wrapper:
         return env_spec._replace(observation_space=map_space(lambda space: stacked_space(space, k), env_spec.observation_space))
 
     return Wrapper("frame_stack", {"name": "frame_stack", "k": k}, spec, _no_statistics, init, step, learn_nothing)
+
+
+def select_observation(entries: Sequence[int]) -> Wrapper:
+    """Only these entries of a Box vector, in this order: what an agent without some of its sensors sees.
+
+    Raises UserError (from ``spec``) for another space, and for entries that are not there.
+    """
+
+    def spec(env_spec: EnvSpec) -> EnvSpec:
+        return env_spec._replace(observation_space=selected_space(env_spec.observation_space, entries))
+
+    def view(statistics: PyTree, obs: Observation) -> Observation:
+        del statistics
+        return obs[..., np.asarray(entries)]
+
+    settings = {"name": "select_observation", "entries": _plain(entries)}
+    return _of_view("select_observation", settings, spec, _no_statistics, view)
 
 
 def shape_reward(function: Callable[[Observation, Action, Step], Batch]) -> Wrapper:
@@ -326,6 +344,7 @@ def _from_one(part: dict) -> Wrapper:
         "normalize_observation": normalize_observation,
         "normalize_reward": normalize_reward,
         "frame_stack": frame_stack,
+        "select_observation": select_observation,
     }
     name = part.pop("name", None)
     if name == "chain":
