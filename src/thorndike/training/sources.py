@@ -70,6 +70,30 @@ def where_done(done: Array, chosen: PyTree, otherwise: PyTree) -> PyTree:
     return jax.tree.map(choose, chosen, otherwise)
 
 
+def gathered(emitted: Emitted, last_seen: Observation) -> Step:
+    """The steps of a rollout. Compiled engines reset within the step, so every row is a transition."""
+    last = jax.tree.map(lambda x: x[None], last_seen)
+    return Step(
+        obs=jax.tree.map(lambda rows, last: jnp.concatenate([rows[1:], last]), emitted.seen, last),
+        next_obs=emitted.next_seen,
+        reward=emitted.reward,
+        cost=jnp.zeros_like(emitted.reward),
+        terminated=emitted.terminated,
+        truncated=emitted.truncated,
+        valid=jnp.ones(emitted.reward.shape, bool),
+    )
+
+
+def episodes_of(emitted: Emitted) -> EpisodeStats:
+    """The episodes that ended in a rollout."""
+    return EpisodeStats(
+        episodes=jnp.sum(emitted.terminated | emitted.truncated, dtype=jnp.float32),
+        return_sum=jnp.sum(emitted.finished_return),
+        length_sum=jnp.sum(emitted.finished_length),
+        steps=jnp.full((), emitted.reward.size, jnp.float32),
+    )
+
+
 def compiled_source(environment: Environment, algorithm: Algorithm, wrapper: Wrapper) -> Source:
     """Rollouts of a compiled environment: pure, traced together with the learner."""
     spec, length = environment.spec, algorithm.needs.rollout_length
@@ -122,24 +146,8 @@ def compiled_source(environment: Environment, algorithm: Algorithm, wrapper: Wra
             emitted = jax.tree.map(lambda x: x[None], emitted)
         else:
             state, emitted = jax.lax.scan(lambda carry, row: one_step(carry, actor, row), state, noise)
-        last_seen = jax.tree.map(lambda x: x[None], state.seen)
-        # Compiled engines reset within the step, so every row is a transition.
-        step = Step(
-            obs=jax.tree.map(lambda rows, last: jnp.concatenate([rows[1:], last]), emitted.seen, last_seen),
-            next_obs=emitted.next_seen,
-            reward=emitted.reward,
-            cost=jnp.zeros_like(emitted.reward),
-            terminated=emitted.terminated,
-            truncated=emitted.truncated,
-            valid=jnp.ones(emitted.reward.shape, bool),
-        )
-        rollout = Rollout(emitted.seen, emitted.action, emitted.extras, step, memory)
-        stats = EpisodeStats(
-            episodes=jnp.sum(step.done, dtype=jnp.float32),
-            return_sum=jnp.sum(emitted.finished_return),
-            length_sum=jnp.sum(emitted.finished_length),
-            steps=jnp.full((), emitted.reward.size, jnp.float32),
-        )
+        rollout = Rollout(emitted.seen, emitted.action, emitted.extras, gathered(emitted, state.seen), memory)
+        stats = episodes_of(emitted)
         statistics, wrapper_memory, rollout = wrapper.learn(state.statistics, state.wrapper_memory, rollout)
         return state._replace(statistics=statistics, wrapper_memory=wrapper_memory), rollout, stats
 
