@@ -10,8 +10,7 @@ al. 2016 (arXiv:1506.02438). Deviations from the paper:
 5. With ``target_kl`` the remaining minibatches of an iteration are skipped once the KL estimate passes 1.5 times the target.
 
 Logs ``train/loss``, ``policy_gradient_loss``, ``value_loss``, ``entropy_loss``, ``approx_kl``, ``clip_fraction``, ``explained_variance``,
-``grad_norm``, ``learning_rate``, ``clip_range``, with ``target_kl`` also ``early_stop`` (the share of iterations cut
-short). Results and their commands: docs/algorithms/ppo.md.
+``grad_norm``, ``learning_rate``, ``clip_range``, with ``target_kl`` ``early_stop``. Results: docs/algorithms/ppo.md.
 """
 
 from collections.abc import Callable

@@ -37,7 +37,10 @@ def optional(kind: Kind) -> Kind:
 
 TEXT = Kind("a short text", lambda value: isinstance(value, str) and value.isprintable() and len(value) < 4096)
 FLAG = Kind("true or false", lambda value: isinstance(value, bool))
-SECONDS = Kind("a number of at least 0", lambda value: type(value) in (int, float) and math.isfinite(value) and value >= 0)  # type: ignore[arg-type, operator]
+SECONDS = Kind(
+    "a number of at least 0",
+    lambda value: isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value) and value >= 0,
+)
 OBJECT = Kind("an object", lambda value: isinstance(value, dict))
 OBJECTS = Kind("a list of objects", lambda value: isinstance(value, list) and all(isinstance(part, dict) for part in value))
 

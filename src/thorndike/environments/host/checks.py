@@ -30,7 +30,7 @@ STEP_GIVES = "(observation, reward, terminated, truncated, info)"
 RESET_GIVES = "(observation, info)"
 _FIRST, _EVERY = 1000, 100
 _FEW = 64
-_PLAIN_NUMBERS = frozenset([float, int, bool, np.float64, np.float32])
+_PLAIN_NUMBERS = (float, int, np.float32, Real)
 _LOOSE_BOUNDS = frozenset(["LunarLander", "LunarLanderContinuous", "BipedalWalker", "BipedalWalkerHardcore"])
 """Gymnasium's tasks whose observations leave their own Box: with random actions in up to 5 % of LunarLander's steps."""
 
@@ -130,8 +130,8 @@ def check_flags(terminated: object, truncated: object) -> None:
 
 def number(reward: object) -> float:
     """A reward as a float. Raises Fault for anything but one real number."""
-    if type(reward) in _PLAIN_NUMBERS or isinstance(reward, Real) or (isinstance(reward, np.ndarray) and reward.ndim == 0):
-        return float(reward)  # type: ignore[arg-type]
+    if isinstance(reward, _PLAIN_NUMBERS) or (isinstance(reward, np.ndarray) and reward.ndim == 0):
+        return float(reward)
     shape = np.shape(reward) if isinstance(reward, np.ndarray | list | tuple) else ()
     came = f"of shape {shape}" if shape else f"{reward!r:.60}"
     raise Fault(f"returned a reward {came}, where one number is expected", "return a float")
