@@ -43,6 +43,15 @@ BARS = (
     Bar("dqn", "Acrobot-v1", "mean", -82),
     Bar("dqn", "MountainCar-v0", "iqm", -110),
     Bar("dqn", "LunarLander-v3", "mean", 200),
+    Bar("sac", "Pendulum-v1", "mean", -165),
+    Bar("sac", "MountainCarContinuous-v0", "mean", 93),
+    Bar("td3", "Pendulum-v1", "mean", -165),
+    Bar("ddpg", "Pendulum-v1", "mean", -165),
+    Bar("tqc", "Pendulum-v1", "mean", -165),
+    Bar("qr_dqn", "CartPole-v1", "iqm", 490),
+    Bar("qr_dqn", "Acrobot-v1", "mean", -78),
+    Bar("rainbow", "CartPole-v1", "iqm", 490),
+    Bar("pqn", "CartPole-v1", "iqm", 490),
     Bar("q_learning", "FrozenLake-v1", "mean", 0.70, episodes=1000),
     Bar("q_learning", "Taxi-v4", "mean", 7.8, episodes=1000),
     Bar("q_learning", "CliffWalking-v1", "mean", -13, worst=-13),
@@ -105,7 +114,7 @@ def write(content: dict) -> Path:
 def tables() -> None:
     """Write the tables of the README and of the algorithms' pages from the JSON files."""
     results = [json.loads(path.read_text()) for path in sorted(RESULTS.glob("*.json"))]
-    for algorithm in ("ppo", "dqn", "a2c", "reinforce"):
+    for algorithm in ("ppo", "dqn", "rainbow", "qr_dqn", "pqn", "a2c", "reinforce", "sac", "td3", "ddpg", "tqc", "crossq", "redq"):
         own = [result for result in results if result["bar"]["algorithm"] == algorithm]
         head = ["environment", "steps", "mean", "IQM", "worst seed", "95 % interval of the mean", "bar", "CPU-s, 10 seeds", "command"]
         _replace(ROOT / "docs" / "algorithms" / f"{algorithm}.md", [head, *(_row(result) for result in own)])

@@ -11,7 +11,7 @@ import math
 import operator
 import re
 import typing
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import lru_cache
 from numbers import Integral, Real
@@ -133,10 +133,11 @@ def check(config: object) -> None:
     where = type(config).__module__.rpartition(".")[2]
     config_class: type = type(config)
     for facts in _declared(config_class):
-        _check_value(getattr(config, facts.name), facts, where)
+        check_value(getattr(config, facts.name), facts, where)
 
 
-def read_config_fields(algorithm: str) -> dict[str, FieldFacts]:
+@lru_cache(maxsize=64)
+def read_config_fields(algorithm: str) -> Mapping[str, FieldFacts]:
     """The settings of an algorithm by name, read from ``algorithms/<name>.py`` without importing it.
 
     Raises UserError for an algorithm that does not exist.
@@ -165,19 +166,29 @@ def parse_settings(texts: Iterable[str], known: Mapping[str, FieldFacts], algori
         name = name.replace("-", "_")
         if not equals or not name:
             raise UserError(f"--set {text}: expected NAME=VALUE, for example --set gamma=0.99")
-        facts = known.get(name)
-        if facts is None:
-            raise UserError(f"{algorithm} has no setting '{name}'{_suggest_setting(name, known)}")
-        values[name] = _parse(value, facts.kind)
-        _check_value(values[name], facts, algorithm)
+        values[name] = parse_value(value, find_setting(name, known, algorithm), algorithm)
     return values
+
+
+def find_setting(name: str, known: Mapping[str, FieldFacts], algorithm: str) -> FieldFacts:
+    """The facts of a setting. Raises UserError, with a suggestion, if there is none of that name."""
+    if name not in known:
+        raise UserError(f"{algorithm} has no setting '{name}'{_suggest_setting(name, known)}")
+    return known[name]
+
+
+def parse_value(text: str, facts: FieldFacts, algorithm: str) -> object:
+    """A text as a value of the declared type. Raises UserError for one of another type or out of bounds."""
+    value = _parse(text, facts.kind)
+    check_value(value, facts, algorithm)
+    return value
 
 
 def describe_kind(kind: Kind) -> str:
     """A type in a newcomer's words: "a whole number", "true or false"."""
     if kind in _WORDS:
         return _WORDS[kind]
-    if _is_rate(kind):
+    if is_rate(kind):
         return "a number or a schedule such as linear(1e-3, 0)"
     origin, arguments = get_origin(kind), get_args(kind)
     if origin is Literal:
@@ -193,7 +204,8 @@ _WORDS: dict[Kind, str] = {int: "a whole number", float: "a number", bool: "true
 _EXAMPLES: dict[Kind, str] = {int: "64,64", float: "0.1,0.2", str: "a,b"}
 
 
-def _check_value(value: object, facts: FieldFacts, where: str) -> None:
+def check_value(value: object, facts: FieldFacts, where: str) -> None:
+    """Raises UserError for a value that is not of the declared type, or out of bounds."""
     default = "" if facts.default is None else f" (default {facts.default})"
     expected = describe_kind(facts.kind)
     if not _matches(value, facts.kind):
@@ -201,11 +213,13 @@ def _check_value(value: object, facts: FieldFacts, where: str) -> None:
     for bound in facts.bounds:
         if not all(bound.admits(part) for part in _parts(value)):
             raise UserError(f"{where}: {facts.name} = {value}, but it must be {bound}{default}")
+    if not all(_is_usable(part) for part in _parts(value)):
+        raise UserError(f"{where}: {facts.name} = {value}, but it must be finite, and a whole number below 2^53{default}")
 
 
 def _matches(value: object, kind: Kind) -> bool:
     origin, arguments = get_origin(kind), get_args(kind)
-    if _is_rate(kind) and isinstance(value, str):
+    if is_rate(kind) and isinstance(value, str):
         return _rates_of(value) is not None
     if origin in (Union, UnionType):
         return any(_matches(value, argument) for argument in arguments)
@@ -217,6 +231,14 @@ def _matches(value: object, kind: Kind) -> bool:
     if kind is float or kind is int:
         return isinstance(value, Real if kind is float else Integral) and not isinstance(value, bool)
     return not isinstance(kind, type) or kind is object or isinstance(value, kind)
+
+
+def _is_usable(value: object) -> bool:
+    """Whether a number is finite, and if it is whole no larger than what a float can tell from the next."""
+    return not isinstance(value, Real) or (abs(int(value)) < _MOST if isinstance(value, Integral) else math.isfinite(value))
+
+
+_MOST = 2**53
 
 
 def _parts(value: object) -> tuple[object, ...]:
@@ -247,12 +269,13 @@ def _rates_of(text: str) -> tuple[float, ...] | None:
     return rates[:2] if sound else None
 
 
-def _is_rate(kind: Kind) -> bool:
+def is_rate(kind: Kind) -> bool:
+    """Whether a setting takes a number or a schedule."""
     return get_origin(kind) in (Union, UnionType) and {float, str} <= set(get_args(kind))
 
 
 def _parse(text: str, kind: Kind) -> object:
-    """The text as `kind`, or as it is where it fits none: `_check_value` then says what was expected."""
+    """The text as `kind`, or as it is where it fits none: `check_value` then says what was expected."""
     for candidate in get_args(kind) if get_origin(kind) in (Union, UnionType) else (kind,):
         value = _parse_one(text, candidate)
         if _matches(value, candidate):
@@ -308,17 +331,25 @@ def _facts(name: str, annotation: object, default: str | None = None, comment: s
 
 
 def _class_fields(node: ast.ClassDef, names: "_Names", source: str) -> Iterable[FieldFacts]:
-    lines = source.splitlines()
+    lines = source.split("\n")
     for statement, follower in zip(node.body, [*node.body[1:], None], strict=True):
         if not isinstance(statement, ast.AnnAssign) or not isinstance(statement.target, ast.Name):
             continue
-        default = None if statement.value is None else ast.get_source_segment(source, statement.value)
+        default = None if statement.value is None else _text_of(statement.value, lines)
         # Columns count bytes of UTF-8.
         line = lines[(statement.end_lineno or statement.lineno) - 1].encode()
         comment = line[statement.end_col_offset or 0 :].decode().strip().lstrip("# ")
         if not comment and isinstance(follower, ast.Expr) and isinstance(follower.value, ast.Constant):
             comment = str(follower.value.value).strip().partition("\n")[0]
         yield _facts(statement.target.id, names.value_of(statement.annotation), default, comment)
+
+
+def _text_of(node: ast.expr, lines: Sequence[str]) -> str:
+    """An expression as it stands in the source: `ast.get_source_segment`, which would cut the whole source into lines each time."""
+    first, last = node.lineno - 1, (node.end_lineno or node.lineno) - 1
+    rows = [line.encode() for line in lines[first : last + 1]]
+    rows[-1] = rows[-1][: node.end_col_offset]
+    return b"\n".join([rows[0][node.col_offset :], *rows[1:]]).decode()
 
 
 _TYPES: dict[str, object] = {kind.__name__: kind for kind in (int, float, bool, str)}

@@ -26,6 +26,9 @@ Metrics: TypeAlias = dict[str, Array]
 Schedule: TypeAlias = Callable[[Array], Array]
 """Progress in ``[0, 1]`` to a value: how a rate changes over a run."""
 
+Number: TypeAlias = float | Float[Array, ""]
+"""A setting that is a plain number, or traced where the agents of one compiled program differ in it (a sweep)."""
+
 
 class Step(NamedTuple):
     """One step of a batch of environments.

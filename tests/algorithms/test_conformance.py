@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from thorndike.algorithms import a2c, dqn, ppo, q_learning, reinforce
+from thorndike.algorithms import a2c, crossq, ddpg, dqn, iqn, ppo, pqn, q_learning, qr_dqn, rainbow, redq, reinforce, sac, td3, tqc
 from thorndike.environments import wrappers
 from thorndike.environments.native import factory
 from thorndike.environments.native.vectorize import vectorize
@@ -33,6 +33,9 @@ DQN = dqn.Config(
     target_update_interval=16,
     net_arch=(8, 8),
 )
+OF_THE_FAMILY = {name: getattr(DQN, name) for name in ("total_steps", "buffer_size", "learning_starts", "batch_size", "train_freq")}
+OF_THE_FAMILY |= {name: getattr(DQN, name) for name in ("gradient_steps", "target_update_interval", "net_arch")}
+CONTROL = {"total_steps": 1000, "buffer_size": 120, "learning_starts": 20, "batch_size": 8, "train_freq": 8, "net_arch": (8,)}
 TABLE = q_learning.Config(total_steps=1000, n_steps=5)
 
 
@@ -54,13 +57,23 @@ def parts(config, **changes):
 
 BINS = (wrappers.discretise(6),)
 RUN = {
+    "sac": Case(sac.sac, sac.Config(**CONTROL, gradient_steps=3, n_critics=3, policy_delay=2, noise_color=1.0), "Pendulum-v1"),
+    "td3": Case(td3.td3, td3.Config(**CONTROL, gradient_steps=3), "Pendulum-v1"),
+    "crossq": Case(crossq.crossq, crossq.Config(**CONTROL, critic_net_arch=(8,), renorm_warmup=2), "Pendulum-v1"),
     "dqn, lstm": Case(dqn.dqn, parts(DQN, memory="lstm", memory_size=8, sequence_length=4, double=True), "CartPole-v1"),
     "a2c, gru": Case(a2c.a2c, a2c.Config(net_arch=(8,), memory="gru", memory_size=8), "CartPole-v1"),
     "ppo": Case(ppo.ppo, PPO, "CartPole-v1", NORMALISED),
     "dqn": Case(dqn.dqn, parts(DQN, double=True, dueling=True, n_step=3), "CartPole-v1"),
+    "rainbow": Case(rainbow.rainbow, rainbow.Config(**OF_THE_FAMILY, atoms=11), "CartPole-v1"),
+    "pqn": Case(pqn.pqn, pqn.Config(total_steps=1000, n_steps=8, batch_size=16, n_epochs=2, net_arch=(8,)), "CartPole-v1"),
     "q_learning": Case(q_learning.q_learning, parts(TABLE, variant="sarsa"), "MountainCar-v0", BINS),
 }
 ALL = RUN | {
+    "sac, one update a step": Case(sac.sac, sac.Config(**CONTROL | {"train_freq": 4, "gradient_steps": 1}), "Pendulum-v1", NORMALISED),
+    "sac, fixed temperature": Case(sac.sac, sac.Config(**CONTROL, ent_coef=0.1, layer_norm=True), "MountainCarContinuous-v0"),
+    "ddpg": Case(ddpg.ddpg, ddpg.Config(**CONTROL), "Pendulum-v1"),
+    "tqc": Case(tqc.tqc, tqc.Config(**CONTROL, n_quantiles=5), "Pendulum-v1"),
+    "redq": Case(redq.redq, redq.Config(**CONTROL | {"gradient_steps": 4}, policy_delay=4), "Pendulum-v1"),
     "ppo, Box, KL stop, clipped value": Case(ppo.ppo, parts(PPO, target_kl=0.01, clip_range_vf=0.2), "Pendulum-v1", NORMALISED),
     "ppo, frames": Case(
         ppo.ppo, parts(PPO, normalize_advantage=False, clip_range="cosine(0.2, 0.1)"), "Acrobot-v1", (wrappers.frame_stack(3),)
@@ -69,7 +82,14 @@ ALL = RUN | {
     "a2c, lstm": Case(a2c.a2c, a2c.Config(net_arch=(8,), memory="lstm", memory_size=8), "CartPole-v1"),
     "a2c, Box": Case(a2c.a2c, a2c.Config(net_arch=(8,)), "Pendulum-v1"),
     "reinforce": Case(reinforce.reinforce, reinforce.Config(n_steps=8, net_arch=(8,)), "CartPole-v1"),
+    "reinforce, lstm": Case(reinforce.reinforce, reinforce.Config(n_steps=8, net_arch=(8,), memory="lstm", memory_size=8), "CartPole-v1"),
     "dqn, gru": Case(dqn.dqn, parts(DQN, memory="gru", memory_size=8, sequence_length=4), "CartPole-v1"),
+    "qr_dqn": Case(qr_dqn.qr_dqn, qr_dqn.Config(**OF_THE_FAMILY, n_quantiles=5, prioritized=True), "CartPole-v1"),
+    "iqn": Case(iqn.iqn, iqn.Config(**OF_THE_FAMILY, n_quantiles=5, munchausen=True, dueling=True), "CartPole-v1"),
+    "dqn, noisy quantiles with memory": Case(
+        dqn.dqn, parts(DQN, memory="gru", memory_size=8, sequence_length=4, noisy=True, distribution="quantile"), "CartPole-v1"
+    ),
+    "dqn, munchausen, resets": Case(dqn.dqn, parts(DQN, munchausen=True, reset_every=40, tau=0.1, gradient_steps=-1), "CartPole-v1"),
     "dqn, plain": Case(dqn.dqn, parts(DQN, learning_rate="exponential(1e-3, 1e-4)"), "CartPole-v1"),
     **{
         f"q_learning, {variant}": Case(q_learning.q_learning, parts(TABLE, variant=variant, visits_power=0.5), "MountainCar-v0", BINS)
@@ -198,6 +218,13 @@ def test_a_seed_among_others_is_that_seed_alone(bound):
     many, reports = advance(bound, ITERATIONS)
     one, report = bound.alone.advance(bound.alone.init(), 0, ITERATIONS)
     assert_equal(jax.tree.map(lambda leaf: leaf[1:2], (many, reports[0])), (one, report))
+
+
+@pytest.mark.parametrize("name", ["reinforce", "reinforce, lstm", "ppo, gru", "a2c, Box"])
+def test_a_seed_among_others_is_that_seed_alone_in_learners_that_are_not_tried_as_a_whole(name, quick_compile):
+    many, alone = (runner(*ALL[name].make(), 3, indices) for indices in (range(2), [1]))
+    (carry, report), (one, told) = (each.advance(each.init(), 0, 2) for each in (many, alone))
+    assert_equal(jax.tree.map(lambda leaf: leaf[1:2], (carry, report)), (one, told))
 
 
 def test_training_saving_loading_and_training_on_is_training_without_a_stop(bound, tmp_path: Path):

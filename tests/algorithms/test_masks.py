@@ -9,7 +9,7 @@ import pytest
 from gymnasium import spaces
 
 from algorithms.small_environments import forbidding
-from thorndike.algorithms import a2c, dqn, ppo, q_learning, reinforce
+from thorndike.algorithms import a2c, dqn, iqn, ppo, pqn, q_learning, rainbow, reinforce
 from thorndike.environments import wrappers
 from thorndike.environments.host.action_masks import mask_in_observation
 from thorndike.environments.native.vectorize import vectorize
@@ -55,8 +55,14 @@ def test_masked_ppo_never_picks_a_forbidden_action(memory, at_least):
         pytest.param(reinforce.reinforce, reinforce.Config(n_steps=16, learning_rate=1e-2, net_arch=(32,)), 300, 1, marks=pytest.mark.slow),
         (dqn.dqn, dqn.Config(learning_rate=2e-3, learning_starts=512, train_freq=64, gradient_steps=4, gamma=0.5, exploration_final_eps=0.2,
                              target_update_interval=640, double=True, n_step=2, net_arch=(32,), total_steps=60_000), 900, 1),
+        (pqn.pqn, pqn.Config(learning_rate=2e-3, n_steps=16, batch_size=256, gamma=0.5, net_arch=(32,), total_steps=100_000), 100, 1),
+        pytest.param(rainbow.rainbow, rainbow.Config(learning_rate=2e-3, learning_starts=512, train_freq=64, gradient_steps=4, gamma=0.5,
+                     target_update_interval=640, net_arch=(32,), total_steps=60_000), 900, 1, marks=pytest.mark.slow),
+        pytest.param(iqn.iqn, iqn.Config(learning_rate=2e-3, learning_starts=512, train_freq=64, gradient_steps=4, gamma=0.5,
+                     target_update_interval=640, net_arch=(32, 32), exploration_final_eps=0.2, munchausen=True, total_steps=60_000),
+                     900, 1, marks=pytest.mark.slow),
     ],
-    ids=["ppo, two components", "a2c", "reinforce", "dqn"],
+    ids=["ppo, two components", "a2c", "reinforce", "dqn", "pqn", "rainbow", "munchausen iqn"],
 )  # fmt: skip
 def test_learners_choose_the_best_of_what_is_allowed(build, config, iterations, components, quick_compile):
     _, worst, late = train(build, config, iterations, components)

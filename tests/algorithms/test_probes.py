@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from thorndike.algorithms import a2c, dqn, ppo, q_learning, reinforce
+from thorndike.algorithms import a2c, crossq, ddpg, dqn, iqn, ppo, pqn, q_learning, qr_dqn, rainbow, redq, reinforce, sac, td3, tqc
 from thorndike.environments import wrappers
 from thorndike.environments.native import factory
 from thorndike.environments.native.randomness import draw_words
@@ -94,8 +94,11 @@ class Learnt(NamedTuple):
         return jax.vmap(one)(*jax.tree.map(lambda leaf: leaf[number * SEEDS : (number + 1) * SEEDS], (self.actors, self.statistics)))
 
 
-def learn(probes: tuple[Probe, ...], build, iterations: int, wrapper: Wrapper | None = None) -> Learnt:
-    """Train ten seeds on each of ``probes``, which have one kind of action, in one program."""
+def learn(probes: tuple[Probe, ...], build, iterations: int, wrapper: Wrapper | None = None, noisy: bool = False) -> Learnt:
+    """Train ten seeds on each of ``probes``, which have one kind of action, in one program.
+
+    A ``noisy`` policy is one that explores by noise on its actions: it is asked without that.
+    """
     wrapper = wrappers.chain() if wrapper is None else wrapper
     algorithm = build(wrapper.spec(several(probes, 0).spec))
     which = jnp.repeat(jnp.arange(len(probes)), SEEDS)
@@ -106,6 +109,7 @@ def learn(probes: tuple[Probe, ...], build, iterations: int, wrapper: Wrapper | 
 
     carry = bound.init()._replace(source=jax.jit(jax.vmap(begin))(which, jax.random.split(jax.random.key(1), len(which))))
     carry, _ = bound.advance(carry, 0, iterations)
+    algorithm = algorithm._replace(act=algorithm.greedy) if noisy else algorithm
     return Learnt(probes, jax.vmap(algorithm.actor)(carry.learner), carry.source.statistics, algorithm, wrapper)
 
 
@@ -139,22 +143,47 @@ def reinforce_for(iterations: int, spec: EnvSpec, **settings) -> Algorithm:
     return reinforce.reinforce(reinforce.Config(total_steps=iterations * 20 * NUM_ENVS, **(config | settings)), spec)
 
 
-def dqn_for(iterations: int, spec: EnvSpec, **parts) -> Algorithm:
-    config = dqn.Config(
-        **parts,
-        total_steps=iterations * NUM_ENVS,
-        learning_rate="linear(0.005, 0)",
-        buffer_size=4000,
-        learning_starts=200,
-        train_freq=NUM_ENVS,
-        gradient_steps=4,
-        batch_size=32,
-        target_update_interval=10 * NUM_ENVS,
-        gamma=GAMMA,
-        exploration_final_eps=0.2,
-        net_arch=(16,),
-    )
-    return dqn.dqn(config, spec)
+def dqn_for(iterations: int, spec: EnvSpec, learner=dqn, **parts) -> Algorithm:
+    """A learner of the deep Q family: a module of ``thorndike.algorithms``."""
+    name = learner.__name__.rpartition(".")[2]
+    config = {
+        "total_steps": iterations * NUM_ENVS,
+        "learning_rate": "linear(0.005, 0)",
+        "buffer_size": 4000,
+        "learning_starts": 200,
+        "train_freq": NUM_ENVS,
+        "gradient_steps": 4,
+        "batch_size": 32,
+        "target_update_interval": 10 * NUM_ENVS,
+        "gamma": GAMMA,
+        "exploration_final_eps": 0.2,
+        "net_arch": (16,),
+    }
+    return getattr(learner, name)(learner.Config(**(config | parts)), spec)
+
+
+def pqn_for(iterations: int, spec: EnvSpec, **settings) -> Algorithm:
+    config = {"n_steps": 10, "batch_size": 80, "gamma": GAMMA, "learning_rate": "linear(0.01, 0)", "net_arch": (16,)}
+    config |= {"exploration_final_eps": 0.2, "trace_decay": 0.5, "total_steps": iterations * 10 * NUM_ENVS}
+    return pqn.pqn(pqn.Config(**(config | settings)), spec)
+
+
+def control_for(iterations: int, learner, spec: EnvSpec, **parts) -> Algorithm:
+    """A learner of continuous control: a module of ``thorndike.algorithms``."""
+    name = learner.__name__.rpartition(".")[2]
+    tau = {"tau": 0.05} if learner is not crossq else {}
+    config = tau | {
+        "total_steps": iterations * NUM_ENVS,
+        "learning_rate": "linear(0.01, 0)",
+        "buffer_size": 4000,
+        "learning_starts": 200,
+        "train_freq": NUM_ENVS,
+        "gradient_steps": 2,
+        "batch_size": 32,
+        "gamma": GAMMA,
+        "net_arch": (16,),
+    }
+    return getattr(learner, name)(learner.Config(**(config | parts)), spec)
 
 
 def table_for(iterations: int, variant: str, spec: EnvSpec) -> Algorithm:
@@ -180,12 +209,28 @@ CASES = {
     "a2c": lambda: learn(DISCRETE, partial(a2c_for, 600), 600),
     "reinforce": lambda: learn(DISCRETE, partial(reinforce_for, 800), 800),
     "dqn": lambda: learn(DISCRETE, partial(dqn_for, 1200), 1200),
+    "pqn": lambda: learn(DISCRETE, partial(pqn_for, 400), 400),
     "q_learning": lambda: learn(DISCRETE, partial(table_for, 60, "q_learning"), 60, wrappers.discretise(3)),
+    "sac": lambda: learn(BOX, partial(control_for, 700, sac), 700),
 }
 SLOW_CASES = {
+    "td3": lambda: learn(BOX, partial(control_for, 700, td3, action_noise=0.3), 700, noisy=True),
+    "ddpg": lambda: learn(BOX, partial(control_for, 700, ddpg, action_noise=0.3), 700, noisy=True),
+    "tqc": lambda: learn(BOX, partial(control_for, 1200, tqc), 1200),
+    "crossq": lambda: learn(
+        BOX, partial(control_for, 1000, crossq, critic_net_arch=(32,), renorm_warmup=100, batch_size=64, ent_coef_init=0.1), 1000
+    ),
+    "redq": lambda: learn(BOX, partial(control_for, 1200, redq, gradient_steps=4, policy_delay=2, n_critics=4), 1200),
     "a2c, Box": lambda: learn(BOX, partial(a2c_for, 600, log_std_init=-2.0), 600),
     "reinforce, Box": lambda: learn(BOX, partial(reinforce_for, 800, log_std_init=-2.0), 800),
     "dqn, double, dueling, 3 steps": lambda: learn(DISCRETE, partial(dqn_for, 1200, double=True, dueling=True, n_step=3), 1200),
+    "rainbow": lambda: learn(DISCRETE, partial(dqn_for, 1200, learner=rainbow, v_min=-12.0, v_max=12.0, atoms=25), 1200),
+    "dqn, prioritised": lambda: learn(DISCRETE, partial(dqn_for, 1200, prioritized=True), 1200),
+    "dqn, noisy": lambda: learn(DISCRETE, partial(dqn_for, 2000, noisy=True), 2000),
+    "dqn, c51": lambda: learn(DISCRETE, partial(dqn_for, 1200, distribution="c51", v_min=-12.0, v_max=12.0, atoms=25), 1200),
+    "dqn, reset": lambda: learn(DISCRETE, partial(dqn_for, 2400, reset_every=801 * NUM_ENVS), 2400),
+    "qr_dqn": lambda: learn(DISCRETE, partial(dqn_for, 1200, learner=qr_dqn, n_quantiles=8), 1200),
+    "iqn": lambda: learn(DISCRETE, partial(dqn_for, 2000, learner=iqn, n_quantiles=8, net_arch=(16, 16)), 2000),
     "sarsa": lambda: learn(DISCRETE, partial(table_for, 100, "sarsa"), 100, wrappers.discretise(3)),
     "expected sarsa": lambda: learn(DISCRETE, partial(table_for, 100, "expected_sarsa"), 100, wrappers.discretise(3)),
     "double q": lambda: learn(DISCRETE, partial(table_for, 100, "double_q"), 100, wrappers.discretise(3)),

@@ -16,7 +16,7 @@ def check(name):
 
 def test_the_ids_read_from_text_are_those_gymnasium_registers():
     own = {id for id, spec in gymnasium.registry.items() if spec.namespace is None and "gymnasium" in str(spec.entry_point)}
-    known = environment_names._ids_without_plugins()
+    known = environment_names._ids_in_the_text()
     assert own <= known
     assert known - own <= set(NATIVE) | pool_ids()
 
@@ -27,8 +27,8 @@ def test_a_misspelt_id_gets_the_nearest_one(name, close):
         check(name)
 
 
-def test_where_plugins_may_add_ids_gymnasium_is_asked(monkeypatch):
-    monkeypatch.setattr(environment_names, "_ids_without_plugins", lambda: None)
+def test_where_the_text_does_not_tell_gymnasium_is_asked(monkeypatch):
+    monkeypatch.setattr(environment_names, "_ids_in_the_text", lambda: None)
     with pytest.raises(UserError, match="did you mean 'CartPole-v1'"):
         check("CartPol-v1")
     check("CartPole-v1")

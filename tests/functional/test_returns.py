@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from thorndike.functional.returns import discounted_returns, generalized_advantage, n_step_return
+from thorndike.functional.returns import discounted_returns, generalized_advantage, lambda_return, n_step_return
 
 GAMMA, LAMBDA = 0.93, 0.8
 COMPILED = pytest.mark.parametrize("compiled", [False, True], ids=["eager", "jit"])
@@ -134,3 +134,20 @@ def test_n_step_returns_bootstrap_from_a_time_limit_but_not_from_a_death_nor_bey
     np.testing.assert_allclose(total, [3, 2, 2, 2])
     np.testing.assert_allclose(discount, [0.125, 0, 0.25, 0.25])
     np.testing.assert_array_equal(last, [2, 1, 1, 1])
+
+
+@COMPILED
+def test_lambda_returns_are_those_of_a_loop(compiled):
+    rng = np.random.default_rng(2)
+    length, envs, gamma, decay = 12, 3, 0.9, 0.7
+    reward, value = rng.normal(size=(2, length, envs)).astype(np.float32)
+    terminated, truncated = rng.random((2, length, envs)) < 0.2
+    done = terminated | truncated
+    expected = np.zeros((length, envs))
+    for b in range(envs):
+        for t in reversed(range(length)):
+            last = done[t, b] or t == length - 1
+            ahead = value[t, b] if last else (1 - decay) * value[t, b] + decay * expected[t + 1, b]
+            expected[t, b] = reward[t, b] + gamma * (0.0 if terminated[t, b] else ahead)
+    found = maybe_jit(lambda_return, compiled)(*map(jnp.asarray, (reward, value, terminated, done)), gamma, decay)
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)

@@ -2,6 +2,7 @@
 
 from collections import OrderedDict
 
+import flax.linen as nn
 import gymnasium.spaces as spaces
 import jax
 import jax.numpy as jnp
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 from thorndike.errors import UserError
-from thorndike.networks.torso import CNN, MLP, Torso, flatten_observation, is_image, torch_uniform
+from thorndike.networks.torso import CNN, MLP, SmallConvolution, Torso, flatten_observation, is_image, torch_uniform
 from thorndike.training.space_files import space_from_json, space_to_json
 
 BATCH = 3
@@ -114,10 +115,28 @@ def test_images_are_told_from_rows(space, image):
     ],
 )
 def test_large_images_get_the_nature_network_and_small_ones_one_layer(size, kernels):
-    module, image = CNN(128, jax.nn.initializers.orthogonal()), jax.ShapeDtypeStruct((2, *size), jnp.float32)
+    module, image = CNN((128,), jax.nn.initializers.orthogonal()), jax.ShapeDtypeStruct((2, *size), jnp.float32)
     features, variables = jax.eval_shape(lambda key, x: module.init_with_output(key, x), jax.random.key(0), image)
     assert features.shape == (2, 128)
     assert sorted(layer["kernel"].shape for layer in variables["params"].values()) == sorted(kernels)
+
+
+def test_the_dense_layers_after_convolutions_are_those_asked_for():
+    torso = Torso(spaces.Box(0, 1, (10, 10, 4), bool), (32, 8), "tanh", torch_uniform)
+    features, variables = torso.init_with_output(jax.random.key(0), jnp.ones((2, 10, 10, 4), bool))
+    assert features.shape == (2, 8)
+    layers = variables["params"]["CNN_0"]
+    assert {name: layers[name]["kernel"].shape for name in ("Dense_0", "Dense_1")} == {"Dense_0": (1024, 32), "Dense_1": (32, 8)}
+
+
+def test_the_convolution_of_small_images_is_flaxs():
+    image = jax.random.normal(jax.random.key(1), (5, 7, 10, 4))
+    mine = SmallConvolution(16, torch_uniform)
+    theirs = nn.Conv(16, (3, 3), padding="VALID", kernel_init=torch_uniform)
+    variables = theirs.init(jax.random.key(0), image)
+    assert jax.tree.all(jax.tree.map(np.array_equal, variables, mine.init(jax.random.key(0), image)))
+    variables["params"]["bias"] = jnp.arange(16.0)
+    np.testing.assert_allclose(mine.apply(variables, image), theirs.apply(variables, image), rtol=1e-4, atol=1e-4)
 
 
 def test_pixels_are_scaled_to_1_and_a_grey_image_gets_a_channel():

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,7 @@ from thorndike.cli.main import main
 from thorndike.environments import wrappers
 from thorndike.errors import UserError
 from thorndike.training import machine
+from thorndike.training.metrics import MetricsLog
 from thorndike.training.run_directory import checkpoints, read_run, write_json
 from thorndike.training.run_lock import run_lock
 from training.damage import DAMAGES, HOSTILE, seal_again
@@ -128,6 +130,45 @@ def test_a_run_stopped_between_its_last_checkpoint_and_its_policy_gets_the_polic
     assert difference(made, run) is None
 
 
+@pytest.mark.parametrize("engine", ["native", "gymnasium"])
+def test_a_run_that_was_evaluated_and_watched_on_the_way_trains_to_the_same_bytes(tmp_path, engine, monkeypatch):
+    pytest.importorskip("imageio_ffmpeg")
+    request = {
+        "steps": 192,
+        "num_envs": 4,
+        "seeds": 2,
+        "settings": PPO_SETTINGS,
+        "preset": "none",
+        "engine": engine,
+        "checkpoint_every": 64,
+    }
+    whole = td.train("ppo", "CartPole-v1", output=tmp_path / "whole", **request).run
+    monkeypatch.setattr(MetricsLog, "write", stops_after(3, MetricsLog.write))
+    stopped = td.train("ppo", "CartPole-v1", output=tmp_path / "stopped", **request)
+    monkeypatch.undo()
+    assert stopped.status == "interrupted"
+    assert main(["eval", str(stopped.run), "--episodes", "2", "--json"]) == 0
+    assert main(["watch", str(stopped.run), "--video", str(tmp_path / "film.mp4")]) == 0
+    policy = td.load(stopped.run)
+    policy.evaluate(2, seed=0, deterministic=False)
+    assert td.resume(stopped.run).status == "finished"
+    assert td.load(stopped.run).evaluate(2).episodes == 2
+    assert difference(whole, stopped.run) is None
+
+
+def stops_after(lines: int, write):
+    """``write``, which after so many lines has the process interrupted."""
+    written = []
+
+    def then_interrupted(*arguments):
+        written.append(1)
+        if len(written) == lines:
+            signal.raise_signal(signal.SIGINT)
+        return write(*arguments)
+
+    return then_interrupted
+
+
 # What is not as it was.
 
 
@@ -149,6 +190,27 @@ def test_a_machine_that_may_give_other_bits_is_told_of_in_one_line(run, capsys, 
     td.resume(run)
     found = "NPROC 1 in place of 7; a test computation gives other bits"
     assert capsys.readouterr().err == f"thorndike: the last bits may differ from those that {run} had: {found}\n"
+
+
+ELSEWHERE = [
+    ({"processors": "2"}, "NPROC 1 in place of 2"),
+    ({"versions": {"jax": "0.4.1"}}, f"jax {metadata.version('jax')} in place of 0.4.1"),
+    ({"versions": {"jaxlib": "0.4.1"}}, f"jaxlib {metadata.version('jaxlib')} in place of 0.4.1"),
+    ({"machine": {"features": "avx9000"}}, "the processor lacks avx9000"),
+    ({"machine": {"processor": "Another CPU"}}, "in place of Another CPU"),
+    ({"machine": {"xla_flags": "--other"}}, "in place of --other"),
+    ({"machine": {"self_test": "0123456789abcdef"}}, "a test computation gives other bits"),
+]
+
+
+@pytest.mark.parametrize(("recorded", "words"), ELSEWHERE, ids=[words for _, words in ELSEWHERE])
+def test_what_a_run_recorded_of_another_machine_is_told_in_one_line(run, capsys, recorded, words):
+    (name, value), before = next(iter(recorded.items())), read_run(run)
+    change(run, **{name: before[name] | value if isinstance(value, dict) else value})
+    assert main(["resume", str(run), "--json"]) == 0
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1 and told.startswith(f"thorndike: the last bits may differ from those that {run} had: ")
+    assert words in told and ";" not in told, "what differs, and nothing else"
 
 
 WRONG = [
@@ -223,8 +285,9 @@ def test_a_run_cannot_bring_code_of_its_own(run):
         policy.evaluate(2)
 
 
-def damaged_policies(run: Path, number: int) -> None:
-    """Damage the policy in ``number`` ways: each is one line."""
+def damaged_policies(run: Path, number: int) -> int:
+    """Damage the policy in ``number`` ways: each is one line. How many were found."""
+    found = 0
     aside = Path(shutil.copytree(run / "policy", run / "aside"))
     for seed in range(number):
         chance = random.Random(seed)
@@ -236,10 +299,12 @@ def damaged_policies(run: Path, number: int) -> None:
             td.load(run)
         assert "\n" not in str(error.value) and len(str(error.value)) < 1000, damage.__name__
         assert str(run / "policy") in str(error.value), f"{damage.__name__}: {error.value}"
+        found += 1
+    return found
 
 
 def test_a_damaged_policy_is_one_line_and_a_finished_run_writes_it_again(run, made, capsys):
-    damaged_policies(run, 60)
+    assert damaged_policies(run, 60) == 60
     assert main(["eval", str(run)]) == 2
     told = capsys.readouterr().err
     assert told.count("\n") == 1
@@ -250,7 +315,7 @@ def test_a_damaged_policy_is_one_line_and_a_finished_run_writes_it_again(run, ma
 
 @pytest.mark.slow
 def test_a_thousand_damaged_policies_are_one_line(run):
-    damaged_policies(run, 1000)
+    assert damaged_policies(run, 1000) == 1000
 
 
 POLICY = [

@@ -8,6 +8,8 @@ class Entry(NamedTuple):
 
     module: str
     description: str
+    actions: tuple[str, ...] = ()
+    """The kinds of action space that it takes; empty for all of them."""
 
 
 ALGORITHMS: dict[str, Entry] = {
@@ -16,8 +18,30 @@ ALGORITHMS: dict[str, Entry] = {
     "reinforce": Entry(
         "thorndike.algorithms.reinforce", "Policy gradient by whole returns, with or without a baseline; all kinds of actions"
     ),
-    "dqn": Entry("thorndike.algorithms.dqn", "Deep Q-network: replay and target network; double, dueling, n-step; Discrete actions"),
-    "q_learning": Entry("thorndike.algorithms.q_learning", "Q-learning from a table; SARSA, expected SARSA, double Q, Q(lambda)"),
-    "planning": Entry("thorndike.algorithms.planning", "Value iteration, policy iteration, evaluation, finite horizon on a known model"),
+    "dqn": Entry(
+        "thorndike.algorithms.dqn",
+        "Deep Q-network: replay and target network; every part of the family to switch on; Discrete actions",
+        ("Discrete",),
+    ),
+    "rainbow": Entry(
+        "thorndike.algorithms.rainbow",
+        "DQN with six improvements: double, dueling, n-step, prioritised, noisy, C51; Discrete actions",
+        ("Discrete",),
+    ),
+    "qr_dqn": Entry("thorndike.algorithms.qr_dqn", "DQN on quantiles of the return; Discrete actions", ("Discrete",)),
+    "iqn": Entry("thorndike.algorithms.iqn", "DQN on returns at random quantile levels; Munchausen; Discrete actions", ("Discrete",)),
+    "pqn": Entry("thorndike.algorithms.pqn", "Q-network without replay or target, many environments; Discrete actions", ("Discrete",)),
+    "sac": Entry("thorndike.algorithms.sac", "Soft actor-critic: off-policy, maximum entropy, learnt temperature; Box actions", ("Box",)),
+    "td3": Entry("thorndike.algorithms.td3", "Twin delayed DDPG: off-policy, deterministic, two critics; Box actions"),
+    "ddpg": Entry("thorndike.algorithms.ddpg", "Deep deterministic policy gradient: off-policy, one critic; Box actions"),
+    "tqc": Entry("thorndike.algorithms.tqc", "Truncated quantile critics: SAC on quantiles of the return; Box actions"),
+    "crossq": Entry("thorndike.algorithms.crossq", "SAC without target networks, batch-renormalised, wide critics; Box actions"),
+    "redq": Entry("thorndike.algorithms.redq", "SAC with ten critics and twenty updates a step: fewest steps; Box actions"),
+    "q_learning": Entry(
+        "thorndike.algorithms.q_learning", "Q-learning from a table; SARSA, expected SARSA, double Q, Q(lambda)", ("Discrete",)
+    ),
+    "planning": Entry(
+        "thorndike.algorithms.planning", "Value iteration, policy iteration, evaluation, finite horizon on a known model", ("Discrete",)
+    ),
 }
 """Name on the command line -> entry. A new algorithm is one more line here."""

@@ -2,30 +2,44 @@
 
 from thorndike.api.building import make
 from thorndike.api.comparing import Comparison, compare
-from thorndike.api.learners import A2C, DQN, PPO, REINFORCE, Learner, QLearning
+from thorndike.api.learners import A2C, DDPG, DQN, IQN, PPO, PQN, QRDQN, REDQ, REINFORCE, SAC, TD3, TQC, CrossQ, Learner, QLearning, Rainbow
 from thorndike.api.loading import LoadedPolicy, load
 from thorndike.api.loading import evaluate_run as evaluate
 from thorndike.api.reproducing import Reproduction, reproduce
+from thorndike.api.sweeping import Sweep, resume_sweep, sweep
 from thorndike.api.training import resume, runs, train
 from thorndike.api.training_result import Result
 
 __all__ = [
     "A2C",
+    "DDPG",
     "DQN",
+    "IQN",
     "PPO",
+    "PQN",
+    "QRDQN",
+    "REDQ",
     "REINFORCE",
+    "SAC",
+    "TD3",
+    "TQC",
     "Comparison",
+    "CrossQ",
     "Learner",
     "LoadedPolicy",
     "QLearning",
+    "Rainbow",
     "Reproduction",
     "Result",
+    "Sweep",
     "compare",
     "evaluate",
     "load",
     "make",
     "reproduce",
     "resume",
+    "resume_sweep",
     "runs",
+    "sweep",
     "train",
 ]

@@ -4,6 +4,7 @@ import dataclasses
 import importlib
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import gymnasium
@@ -28,10 +29,25 @@ if TYPE_CHECKING:
 EnvironmentLike: TypeAlias = str | gymnasium.Env | Callable[..., gymnasium.Env] | gymnasium.vector.VectorEnv | Environment | Dynamics
 
 DEFAULT_STEPS = 100_000
-DEFAULT_NUM_ENVS = {"ppo": 8, "a2c": 8, "reinforce": 8, "dqn": 4, "q_learning": 1}
+DEFAULT_NUM_ENVS = {
+    "ppo": 8,
+    "a2c": 8,
+    "reinforce": 8,
+    "dqn": 4,
+    "rainbow": 4,
+    "qr_dqn": 4,
+    "iqn": 4,
+    "pqn": 16,
+    "q_learning": 1,
+    "sac": 1,
+    "td3": 1,
+    "ddpg": 1,
+    "tqc": 1,
+    "redq": 1,
+}
 LOG_POINTS = 100
 CHECKPOINTS = 10
-_WITH_NETWORK = ("ppo", "a2c", "reinforce", "dqn")
+_WITH_NETWORK = ("ppo", "a2c", "reinforce", "dqn", "rainbow", "qr_dqn", "iqn", "pqn", "sac", "td3", "ddpg", "tqc", "redq")
 
 
 class Request(NamedTuple):
@@ -53,6 +69,15 @@ class Request(NamedTuple):
     num_envs: int
     log_every: int
     checkpoint_every: int
+
+
+class Lanes(NamedTuple):
+    """Agents that are not simply a run's seeds: those of a sweep's trials, side by side."""
+
+    agents: tuple[int, ...]
+    """The number of each in its own trial: agents of the same number begin with the same random numbers."""
+    build: Callable[[EnvSpec], Algorithm]
+    """spec as the learner sees it -> their learner."""
 
 
 class Job(NamedTuple):
@@ -112,12 +137,16 @@ def build_config(name: str, settings: Mapping[str, object]) -> "DataclassInstanc
 
 def build_algorithm(name: str, config: Mapping[str, object], spec: EnvSpec, network: NetworkBuilder | None) -> Algorithm:
     """The algorithm ``name`` for an environment, from its settings. Raises ``UserError`` if they do not fit."""
+    return build_from_config(name, build_config(name, config), spec, network)
+
+
+def build_from_config(name: str, settings: "DataclassInstance", spec: EnvSpec, network: NetworkBuilder | None) -> Algorithm:
+    """The same from a ``Config``, whose numbers may be traced. Raises ``UserError`` if they do not fit."""
     factory = getattr(importlib.import_module(ALGORITHMS[name].module), name)
-    settings = build_config(name, config)
     if network is None:
         return factory(settings, spec)
     if name not in _WITH_NETWORK:
-        raise UserError(f"{name} has no network, so it takes none; {', '.join(_WITH_NETWORK)} do")
+        raise UserError(f"{name} has no network to replace; {', '.join(_WITH_NETWORK)} do")
     return factory(settings, spec, network)
 
 
@@ -159,21 +188,23 @@ def build_job(
     given: Sequence[Wrapper] | None,
     network: NetworkBuilder | None,
     env_timeout: float | None = None,
+    lanes: Lanes | None = None,
 ) -> Job:
-    """Bind a request to its environment, learner, source and runner."""
+    """Bind a request to its environment, learner, source and runner; ``lanes`` are other agents than its seeds, with their own learner."""
     wrapper = wrappers.from_settings(request.wrappers) if given is None else wrappers.chain(*given)
-    indices = range(request.seeds)
+    indices = range(request.seeds) if lanes is None else lanes.agents
+    build = partial(build_algorithm, request.algorithm, request.config, network=network) if lanes is None else lanes.build
     if choice.engine == "native":
         environment = registry.build_native(choice, request.num_envs)
-        algorithm, plan = _learner(request, environment.spec, wrapper, network)
+        algorithm, plan = _learner(request, environment.spec, wrapper, build)
         source: Source | HostSource = compiled_source(environment, algorithm, wrapper)
         spec, close = environment.spec, _nothing
     else:
         engine = registry.build_host(
-            choice, request.num_envs * request.seeds, masks=request.algorithm in _WITH_NETWORK, env_timeout=env_timeout
+            choice, request.num_envs * len(indices), masks=request.algorithm in _WITH_NETWORK, env_timeout=env_timeout
         )
         spec, close = engine.spec._replace(num_envs=request.num_envs), engine.close
-        algorithm, plan = _learner(request, spec, wrapper, network)
+        algorithm, plan = _learner(request, spec, wrapper, build)
         source = host_source(engine, algorithm, wrapper, request.seed, indices, plan.checkpoint_every)
     bound = runner(algorithm, source, request.seed, indices)
     return Job(request, algorithm, wrapper, spec, source, bound, plan, close)
@@ -189,8 +220,8 @@ def is_large(request_algorithm: str, choice: registry.Choice) -> bool:
     return image
 
 
-def _learner(request: Request, spec: EnvSpec, wrapper: Wrapper, network: NetworkBuilder | None) -> tuple[Algorithm, Plan]:
-    algorithm = build_algorithm(request.algorithm, request.config, wrapper.spec(spec), network)
+def _learner(request: Request, spec: EnvSpec, wrapper: Wrapper, build: Callable[[EnvSpec], Algorithm]) -> tuple[Algorithm, Plan]:
+    algorithm = build(wrapper.spec(spec))
     per_iteration = algorithm.needs.rollout_length * request.num_envs
     lengths = (request.steps, request.log_every, request.checkpoint_every)
     iterations, log_every, checkpoint_every = (max(1, math.ceil(n / per_iteration)) for n in lengths)

@@ -8,6 +8,7 @@ import jax
 
 from thorndike.api.building import Job
 from thorndike.environments.wrappers import exported
+from thorndike.records import POLICY_FORMAT
 from thorndike.training.host_source import HostSource
 from thorndike.training.json_files import as_bytes
 from thorndike.training.metrics import LogPoint
@@ -15,8 +16,6 @@ from thorndike.training.runner import Carry
 from thorndike.training.sealed_folders import NewFolder
 from thorndike.training.space_files import space_to_json
 from thorndike.training.tree_files import write_tree
-
-POLICY_FORMAT = 1
 
 
 def export_policy(run: Path, record: dict[str, object], job: Job, carry: Carry, points: Sequence[LogPoint]) -> None:

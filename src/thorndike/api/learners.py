@@ -125,6 +125,66 @@ class DQN(Learner):
     algorithm = "dqn"
 
 
+class Rainbow(Learner):
+    """DQN with six improvements."""
+
+    algorithm = "rainbow"
+
+
+class QRDQN(Learner):
+    """Quantile regression DQN."""
+
+    algorithm = "qr_dqn"
+
+
+class IQN(Learner):
+    """Implicit quantile networks."""
+
+    algorithm = "iqn"
+
+
+class PQN(Learner):
+    """Parallelised Q-network."""
+
+    algorithm = "pqn"
+
+
+class SAC(Learner):
+    """Soft actor-critic."""
+
+    algorithm = "sac"
+
+
+class TD3(Learner):
+    """Twin delayed deep deterministic policy gradient."""
+
+    algorithm = "td3"
+
+
+class DDPG(Learner):
+    """Deep deterministic policy gradient."""
+
+    algorithm = "ddpg"
+
+
+class TQC(Learner):
+    """Truncated quantile critics."""
+
+    algorithm = "tqc"
+
+
+class CrossQ(Learner):
+    """CrossQ: SAC without target networks."""
+
+    algorithm = "crossq"
+
+
+class REDQ(Learner):
+    """Randomised ensembled double Q-learning."""
+
+    algorithm = "redq"
+
+
 class QLearning(Learner):
     """Tabular Q-learning and its relatives."""
 

@@ -51,12 +51,7 @@ class LoadedPolicy:
 
         An environment without a time limit gets one of ``LONGEST_EPISODE`` steps.
         """
-        choice = self._choice()
-        make, limit = self._maker(choice), choice.max_episode_steps
-
-        def build(number: int) -> LoopEngine:
-            return LoopEngine([make] * number, choice.id, limit)
-
+        build = reference_engines(self._choice(), self._policy.spec.observation_space)
         found = evaluate(self._policy, build, episodes, seed, num_envs or 20, deterministic)
         if self.run is not None:
             settings = {"evaluation_seed": seed, "deterministic": deterministic}
@@ -68,11 +63,7 @@ class LoadedPolicy:
     def watch(self, path: str | Path | None = None, episodes: int = 1, seed: int = 0) -> Path | None:
         """Film episodes of the policy as mp4, or show them in a window if no path is given."""
         choice = self._choice()
-        return film(self._policy, self._maker(choice), None if path is None else Path(path), episodes, seed)
-
-    def _maker(self, choice: registry.Choice) -> Callable[..., gymnasium.Env]:
-        make = partial(registry.reference, choice)
-        return mask_in_observation(make) if has_mask(self._policy.spec.observation_space) else make
+        return film(self._policy, _maker(choice, self._policy.spec.observation_space), None if path is None else Path(path), episodes, seed)
 
     def _choice(self) -> registry.Choice:
         if self._environment is None and self.facts["environment_object"]:
@@ -80,14 +71,29 @@ class LoadedPolicy:
         if self._environment is None and self.run is not None:
             refuse_code(self.run, self.facts["environment"])
         named: EnvironmentLike = self.facts["environment"] if self._environment is None else self._environment
-        choice = registry.resolve(named, env_kwargs=self.facts["env_kwargs"], max_episode_steps=self.facts["max_episode_steps"])
-        if choice.max_episode_steps is not None or isinstance(choice.origin, gymnasium.vector.VectorEnv | Environment):
-            return choice
-        probe = registry.reference(choice)
-        limit = limit_of(probe)
-        probe.close()
-        # A greedy policy that walks in circles would never end an episode of an environment without a limit.
-        return choice if limit is not None else choice._replace(max_episode_steps=LONGEST_EPISODE)
+        return bounded(registry.resolve(named, env_kwargs=self.facts["env_kwargs"], max_episode_steps=self.facts["max_episode_steps"]))
+
+
+def bounded(choice: registry.Choice) -> registry.Choice:
+    """The same environment, with a limit of ``LONGEST_EPISODE`` steps if it has none of its own."""
+    if choice.max_episode_steps is not None or isinstance(choice.origin, gymnasium.vector.VectorEnv | Environment):
+        return choice
+    probe = registry.reference(choice)
+    limit = limit_of(probe)
+    probe.close()
+    # A greedy policy that walks in circles would never end an episode of an environment without a limit.
+    return choice if limit is not None else choice._replace(max_episode_steps=LONGEST_EPISODE)
+
+
+def reference_engines(choice: registry.Choice, space: gymnasium.Space) -> Callable[[int], LoopEngine]:
+    """Number -> that many reference environments to evaluate on; ``space`` is what the trained policy observed."""
+    make = _maker(choice, space)
+    return lambda number: LoopEngine([make] * number, choice.id, choice.max_episode_steps)
+
+
+def _maker(choice: registry.Choice, space: gymnasium.Space) -> Callable[..., gymnasium.Env]:
+    make = partial(registry.reference, choice)
+    return mask_in_observation(make) if has_mask(space) else make
 
 
 def load(run: str | Path, *, environment: EnvironmentLike | None = None, network: Callable | None = None) -> LoadedPolicy:

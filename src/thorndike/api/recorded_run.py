@@ -1,41 +1,20 @@
-"""From a run's directory back to what was asked for: the request in ``run.json``, checked, and the objects it cannot hold."""
+"""From a run's directory back to what was asked for: the request in ``run.json``, and the objects it cannot hold."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from thorndike import startup
-from thorndike.api.building import EnvironmentLike, Job, Request, build_job, check_algorithm, full_config
+from thorndike.api.building import EnvironmentLike, Job, Request, build_job
 from thorndike.environments import registry
 from thorndike.errors import UserError
 from thorndike.networks.network import NetworkBuilder
-from thorndike.training.json_files import FLAG, OBJECT, OBJECTS, TEXT, Json, blamed_on, check_fields, optional, whole
+from thorndike.training.json_files import Json, blamed_on
 from thorndike.training.machine import differences
 from thorndike.training.notices import notice
-from thorndike.training.run_directory import facts, read_run
+from thorndike.training.run_directory import facts
 from thorndike.types import Wrapper
 
-_MOST = 10**9
-_FIELDS = {
-    "algorithm": TEXT,
-    "environment": TEXT,
-    "env_kwargs": OBJECT,
-    "max_episode_steps": optional(whole(1)),
-    "engine": TEXT,
-    "config": OBJECT,
-    "wrappers": OBJECTS,
-    "preset": TEXT,
-    "steps": whole(1),
-    "seeds": whole(1, _MOST),
-    "seed": whole(0, 2**32 - 1),
-    "num_envs": whole(1, _MOST),
-    "log_every": whole(1),
-    "checkpoint_every": whole(1),
-    "network": TEXT,
-    "environment_object": FLAG,
-    "device": TEXT,
-    "processors": TEXT,
-}
 _CODE = (".py", ".pyc", ".pyd", ".so", ".pth", ".zip")
 
 
@@ -47,22 +26,9 @@ class Objects(NamedTuple):
     network: NetworkBuilder | None = None
 
 
-def read_record(run: Path) -> Json:
-    """The content of ``run.json``, every field that is needed checked. Raises ``UserError``."""
-    record = read_run(run)
-    check_fields(record, {"algorithm": TEXT}, run / "run.json")
-    if record["algorithm"] == "planning":
-        raise UserError(f"{run} is a plan: it is complete, there is nothing to go on with; `thorndike train planning` plans again")
-    check_fields(record, _FIELDS, run / "run.json")
-    return record
-
-
 def request_in(record: Json, run: Path, objects: Objects) -> Request:
     """The request that a record holds. Raises ``UserError`` if it cannot be, or an object is needed again."""
     request = Request(**{field: record[field] for field in Request._fields})  # type: ignore[arg-type]
-    check_algorithm(request.algorithm)
-    with blamed_on(run / "run.json"):
-        full_config(request.algorithm, {name: tuple(value) if isinstance(value, list) else value for name, value in request.config.items()})
     if record["network"] == "user" and objects.network is None:
         raise UserError(f"{run} was trained with a network of your own; go on in Python, with network=...")
     if record["environment_object"] and objects.environment is None:

@@ -11,9 +11,10 @@ from typing import NamedTuple, cast
 import numpy as np
 
 from thorndike.api.building import EnvironmentLike, Job
-from thorndike.api.recorded_run import Objects, read_record, rebuild, request_in
+from thorndike.api.recorded_run import Objects, rebuild, request_in
 from thorndike.errors import UserError
 from thorndike.networks.network import NetworkBuilder
+from thorndike.records import read_record
 from thorndike.training.checkpoints import STATE, Progressed, restorable
 from thorndike.training.json_files import Json
 from thorndike.training.metrics import LogPoint

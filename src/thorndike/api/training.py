@@ -10,11 +10,12 @@ from thorndike import startup
 from thorndike.api.building import EnvironmentLike, Job, Request, build_job, check_algorithm, full_request, is_large
 from thorndike.api.exporting import export_policy
 from thorndike.api.planning import plan_run
-from thorndike.api.recorded_run import Objects, read_record, rebuild, request_in
+from thorndike.api.recorded_run import Objects, rebuild, request_in
 from thorndike.api.training_result import Result
 from thorndike.environments import registry
 from thorndike.errors import UserError
 from thorndike.networks.network import NetworkBuilder
+from thorndike.records import read_record
 from thorndike.training.checkpoints import restore, save_checkpoint
 from thorndike.training.faults import locate
 from thorndike.training.json_files import Json

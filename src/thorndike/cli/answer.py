@@ -13,6 +13,10 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
 
+_LONGEST = 1200
+"""Characters of an error."""
+
+
 class Answer(NamedTuple):
     """One result in both forms."""
 
@@ -34,6 +38,17 @@ def show(answer: Answer, as_json: bool) -> None:
 
         # In a pipe a row is a line, however long.
         Console(width=None if sys.stdout.isatty() else 1_000, highlight=False).print(answer.text)
+
+
+def one_line(message: str) -> str:
+    """A message on one line that a terminal can show: no control characters, and the middle of what is very long left out."""
+    line = printable(" ".join(message.split()))
+    return line if len(line) <= _LONGEST else f"{line[: _LONGEST // 2]} ... {line[-_LONGEST // 4 :]}"
+
+
+def printable(text: str) -> str:
+    """The text with its control characters, and what is no Unicode, written out: an escape sequence would act on the terminal."""
+    return text if text.isprintable() else "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in text)
 
 
 def as_json_text(data: Mapping[str, object]) -> str:

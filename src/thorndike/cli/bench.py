@@ -32,7 +32,13 @@ def run(words: Sequence[str]) -> Answer:
     options = parser.parse(words)
     algorithm, environment = names(options)
     settings, env_kwargs = given_settings(options, algorithm), given_env_kwargs(options.env_set)
-    check_environment(environment, engine=options.engine, env_kwargs=env_kwargs, max_episode_steps=options.max_episode_steps)
+    check_environment(
+        environment,
+        engine=options.engine,
+        env_kwargs=env_kwargs,
+        max_episode_steps=options.max_episode_steps,
+        algorithm=algorithm,
+    )
     check_preset(algorithm, environment, options.preset)
     from thorndike.api import train
 

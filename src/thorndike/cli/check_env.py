@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from thorndike.cli.answer import Answer
 from thorndike.cli.environment_names import check_environment
-from thorndike.cli.parser import Parser, not_negative_whole, positive_whole
+from thorndike.cli.parser import Parser, positive_whole, seed_number
 from thorndike.cli.train import given_env_kwargs
 from thorndike.environments.host.envpool_ids import pool_ids
 from thorndike.environments.native import NATIVE
@@ -26,7 +26,7 @@ def run(words: Sequence[str]) -> Answer:
     parser = Parser("check-env", "Play an environment with random actions and list what is wrong with it, with fixes.", EXAMPLES)
     parser.add_argument("environment", nargs="?", metavar="ENVIRONMENT", help="an id, module:Id, module:Class or path/to/file.py:Class")
     parser.add_argument("--steps", type=positive_whole, default=1000, help="steps to record and repeat (default: 1000)")
-    parser.add_argument("--seed", type=not_negative_whole, default=0, help="the number everything random follows from (default: 0)")
+    parser.add_argument("--seed", type=seed_number, default=0, help="the number everything random follows from (default: 0)")
     parser.add_argument(
         "--env-set", action="append", default=[], metavar="NAME=VALUE", help="an argument of the environment; may be repeated"
     )

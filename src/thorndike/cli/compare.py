@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from thorndike.cli.answer import Answer
-from thorndike.cli.find_run import add_run_arguments, find_run
+from thorndike.cli.find_run import add_run_arguments, exists, find_run
 from thorndike.cli.parser import Parser, positive_whole
 from thorndike.cli.tables import table, text_of
 from thorndike.plotting.style import check_plot_file
+from thorndike.records import from_policy, read_policy_facts
 from thorndike.statistics.comparison import FEWEST_SEEDS, MOST_SEEDS
-from thorndike.training.run_groups import group_runs
+from thorndike.training.run_groups import all_trained, group_runs, recorded_scores
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -42,7 +43,9 @@ def run(words: Sequence[str]) -> Answer:
     runs = [_find_side(text, options.output) for text in options.runs]
     against = None if options.against is None else find_run(options.against, options.output)
     # JAX is not imported yet: what cannot be compared is told at once.
-    group_runs(runs, against)
+    for trained in all_trained(group_runs(runs, against)):
+        if recorded_scores(trained, options.episodes) is None:
+            from_policy(trained.run, read_policy_facts)
     from thorndike.api import compare
 
     found = compare(runs, metric=options.metric, episodes=options.episodes, against=against, failed_below=options.failed_below)
@@ -61,7 +64,7 @@ def run(words: Sequence[str]) -> Answer:
 
 def _find_side(text: str, output: Path) -> list[Path]:
     """The runs of one learner: ``RUN`` or ``RUN,RUN``."""
-    parts = [text] if Path(text).exists() else text.split(",")
+    parts = [text] if exists(Path(text)) else text.split(",")
     return [find_run(part, output) for part in parts]
 
 

@@ -5,7 +5,8 @@ from collections.abc import Sequence
 
 from thorndike.cli.answer import Answer
 from thorndike.cli.find_run import add_run_arguments, find_run
-from thorndike.cli.parser import Parser, not_negative_whole, positive_whole
+from thorndike.cli.parser import Parser, positive_whole, seed_number
+from thorndike.records import from_policy, read_policy_facts
 
 EXAMPLES = """\
   thorndike eval latest
@@ -18,11 +19,13 @@ def run(words: Sequence[str]) -> Answer:
     add_run_arguments(parser)
     parser.add_argument("--eval-episodes", dest="episodes", type=positive_whole, default=SUPPRESS, help=SUPPRESS)
     parser.add_argument("--episodes", type=positive_whole, default=100, help="episodes of each seed (default: 100)")
-    parser.add_argument("--seed", type=not_negative_whole, default=0, help="the number the episodes follow from (default: 0)")
+    parser.add_argument("--seed", type=seed_number, default=0, help="the number the episodes follow from (default: 0)")
     parser.add_argument("--num-envs", type=positive_whole, default=20, help="environments of each seed, stepped together")
     parser.add_argument("--stochastic", action="store_true", help="draw actions from the policy instead of taking the best one")
     options = parser.parse(words)
     directory = find_run(options.run, options.output)
+    # JAX is not imported yet: a policy that is damaged, or not there, is told of at once.
+    from_policy(directory, read_policy_facts)
     from thorndike.api import load
 
     found = load(directory).evaluate(

@@ -42,7 +42,7 @@ def find_run(text: str, output: Path) -> Path:
     Raises UserError if there is none, or more than one.
     """
     path = Path(text)
-    if path.exists():
+    if exists(path):
         for candidate in (path, *path.parents):
             if candidate.joinpath(FACTS).is_file():
                 return candidate
@@ -60,6 +60,16 @@ def find_run(text: str, output: Path) -> Path:
     close = nearest(text, ["latest", *(run.name for run in known)])
     hint = f"; did you mean '{close}'?" if close else "; `thorndike list` shows the runs"
     raise UserError(f"there is no run '{text}' under {output}/{hint}")
+
+
+def exists(path: Path) -> bool:
+    """Whether there is anything; a name that no file could have is none."""
+    return os.path.exists(path)
+
+
+def is_file(path: Path) -> bool:
+    """Whether there is a file; a name that no file could have is none."""
+    return os.path.isfile(path)
 
 
 def read_facts(run: Path) -> dict[str, object]:

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from thorndike.cli.answer import Answer, as_json_text, show, stdout_for_the_answer_only
+from thorndike.cli.answer import Answer, as_json_text, one_line, show, stdout_for_the_answer_only
 from thorndike.errors import UserError
 from thorndike.suggestions import did_you_mean
 from thorndike.training.stopping import Terminated, leave, prompt_exit
@@ -28,6 +28,7 @@ VERBS: dict[str, Verb] = {
     "eval": Verb("thorndike.cli.evaluate", "RUN", "score a trained policy on fresh reference environments"),
     "watch": Verb("thorndike.cli.watch", "RUN", "film a trained policy as mp4, or show it in a window"),
     "plot": Verb("thorndike.cli.plot", "RUN...", "draw learning curves with their 95 % interval"),
+    "sweep": Verb("thorndike.cli.sweep", "ALGORITHM ENVIRONMENT", "search settings, say which matter, rerun the best on fresh seeds"),
     "compare": Verb("thorndike.cli.compare", "RUN RUN...", "say which run is better, worse, or that nobody can tell yet"),
     "check-env": Verb("thorndike.cli.check_env", "ENVIRONMENT", "say what is wrong with an environment, with fixes"),
     "list": Verb("thorndike.cli.list", "[WHAT]", "list runs, algorithms, environments, presets or settings"),
@@ -53,6 +54,8 @@ examples:
   thorndike watch latest                           see it act
   thorndike plot latest                            draw its learning curve
   thorndike compare ppo-run dqn-run                which is better, and how sure is that
+  thorndike sweep ppo CartPole-v1 --over learning_rate=1e-4,3e-4,1e-3
+                                                   which settings are best, and which matter
 
 A RUN is a run's directory, a part of its name that only it has, or `latest`.
 `thorndike VERB --help` tells more. `thorndike --version` prints the version."""
@@ -119,7 +122,7 @@ def _without_verb(words: list[str]) -> int:
 
 
 def _report(message: str, as_json: bool) -> int:
-    line = " ".join(message.split())
+    line = one_line(message)
     if as_json:
         print(as_json_text({"error": line}))
     print(f"thorndike: {line}", file=sys.stderr)

@@ -43,19 +43,25 @@ class Parser(argparse.ArgumentParser):
         self.error(f"unknown flag {flag}" + (f"; did you mean {close}?" if close else ""))
 
 
+_MOST = 2**53
+"""Beyond it a float cannot tell a whole number from the next."""
+
+
 def positive_whole(text: str) -> int:
     """A whole number of at least 1: ``8``, ``100_000``, ``1e6``, ``100k``, ``1M``."""
     number = _whole(text)
-    if number is None or number < 1:
+    if number is None or not 1 <= number <= _MOST:
         raise argparse.ArgumentTypeError(f"expected a whole number of at least 1, such as 8, 100k or 1e6; got '{text}'")
     return number
 
 
-def not_negative_whole(text: str) -> int:
-    """A whole number of at least 0."""
+def seed_number(text: str) -> int:
+    """A whole number from 0 to 2^32 - 1."""
     number = _whole(text)
     if number is None or number < 0:
         raise argparse.ArgumentTypeError(f"expected a whole number of at least 0; got '{text}'")
+    if number >= 2**32:
+        raise argparse.ArgumentTypeError(f"expected a number from 0 to 2^32 - 1; got '{text}'")
     return number
 
 
@@ -67,7 +73,7 @@ def _whole(text: str) -> int | None:
         number = float(match[1]) * {"": 1, "k": 1e3, "m": 1e6, "g": 1e9}[match[2].lower()]
     except ValueError:
         return None
-    return int(number) if number == int(number) else None
+    return int(number) if number.is_integer() else None
 
 
 def _dashed(word: str) -> str:

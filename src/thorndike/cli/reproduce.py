@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from thorndike.cli.answer import Answer
 from thorndike.cli.find_run import add_run_arguments, find_run
 from thorndike.cli.parser import Parser, positive_whole
+from thorndike.records import read_record
 
 EXAMPLES = """\
   thorndike reproduce latest
@@ -18,6 +19,8 @@ def run(words: Sequence[str]) -> Answer:
     parser.add_argument("--steps", type=positive_whole, help="how far, in steps of each seed (default: as far as the run came)")
     options = parser.parse(words)
     directory = find_run(options.run, options.output)
+    # JAX is not imported yet: what cannot be made again is told at once.
+    read_record(directory)
     from thorndike.api import reproduce
 
     found = reproduce(directory, steps=options.steps, progress=not options.json)

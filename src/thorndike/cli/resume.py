@@ -7,6 +7,7 @@ from thorndike.cli.answer import Answer
 from thorndike.cli.find_run import add_run_arguments, find_run
 from thorndike.cli.parser import Parser, positive_whole
 from thorndike.cli.train import trained
+from thorndike.records import read_record
 from thorndike.training.run_lock import refuse_if_locked
 
 EXAMPLES = """\
@@ -23,6 +24,8 @@ def run(words: Sequence[str]) -> Answer:
     options = parser.parse(words)
     directory = find_run(options.run, options.output)
     refuse_if_locked(directory)
+    # JAX is not imported yet: what cannot be gone on with is told at once.
+    read_record(directory)
     from thorndike.api import resume
 
     return trained(resume(directory, steps=options.steps, progress=not options.json))

@@ -1,15 +1,15 @@
 """``thorndike show RUN``: what a run is, how far it came, what it logged last."""
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from thorndike.cli.answer import Answer
 from thorndike.cli.find_run import add_run_arguments, find_run, last_row, read_facts
 from thorndike.cli.parser import Parser
 from thorndike.cli.tables import facts_table, mean
 from thorndike.statistics.estimates import summary
+from thorndike.training.json_files import NUMBER, check_fields, parse_object, whole
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -33,12 +33,15 @@ def last_evaluation(path: Path) -> dict[str, object] | None:
 
     A file holds one evaluation after another; a new one starts where a seed's episodes count from 0 again.
     """
-    lines = path.read_text(encoding="utf-8").split("\n")[:-1] if path.is_file() else []
+    lines = path.read_bytes().split(b"\n")[:-1] if path.is_file() else []
     returns: dict[int, list[float]] = {}
-    for row in map(json.loads, lines):
+    for line in lines:
+        row = parse_object(line, path)
+        check_fields(row, {"seed": whole(0), "episode": whole(0), "return": NUMBER}, path)
+        seed = cast(int, row["seed"])
         if row["episode"] == 0:
-            returns[row["seed"]] = []
-        returns.setdefault(row["seed"], []).append(row["return"])
+            returns[seed] = []
+        returns.setdefault(seed, []).append(cast(float, row["return"]))
     if not returns:
         return None
     found = summary([sum(values) / len(values) for values in returns.values()])

@@ -4,6 +4,8 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
+from thorndike.cli.answer import printable
+
 if TYPE_CHECKING:
     from rich.table import Table
 
@@ -38,8 +40,10 @@ def text_of(value: object) -> str:
     match value:
         case None:
             return "-"
-        case bool() | str():
+        case bool():
             return str(value)
+        case str():
+            return printable(value)
         case int():
             return f"{value:,}"
         case float():

@@ -1,6 +1,7 @@
 """``thorndike train ALGORITHM ENVIRONMENT``: everything that can be wrong is looked at before JAX is imported."""
 
 import ast
+import errno
 import math
 import os
 import shlex
@@ -12,8 +13,8 @@ from typing import TYPE_CHECKING
 from thorndike.algorithms import ALGORITHMS
 from thorndike.cli.answer import Answer
 from thorndike.cli.environment_names import check_environment
-from thorndike.cli.find_run import add_output_argument
-from thorndike.cli.parser import Parser, not_negative_whole, positive_whole
+from thorndike.cli.find_run import add_output_argument, exists
+from thorndike.cli.parser import Parser, positive_whole, seed_number
 from thorndike.errors import UserError
 from thorndike.settings import FieldFacts, parse_settings, read_config_fields
 from thorndike.suggestions import did_you_mean
@@ -41,9 +42,16 @@ def run(words: Sequence[str]) -> Answer:
     options = _parse(words)
     algorithm, environment = names(options)
     settings, env_kwargs = given_settings(options, algorithm), given_env_kwargs(options.env_set)
-    check_environment(environment, engine=options.engine, env_kwargs=env_kwargs, max_episode_steps=options.max_episode_steps)
+    # Before the environment, for which JAX is imported if it has a table.
+    check_output(options.output)
+    check_environment(
+        environment,
+        engine=options.engine,
+        env_kwargs=env_kwargs,
+        max_episode_steps=options.max_episode_steps,
+        algorithm=algorithm,
+    )
     check_preset(algorithm, environment, options.preset)
-    _check_output(options.output)
     from thorndike.api import train
 
     result = train(
@@ -75,7 +83,7 @@ def add_training_arguments(parser: Parser, fields: Mapping[str, FieldFacts]) -> 
     _add_old_hands_flags(parser)
     parser.add_argument("--steps", type=positive_whole, help="environment steps of each seed: 50000, 50k, 1e6")
     parser.add_argument("--seeds", type=positive_whole, default=1, help="independent agents trained at once (default: 1)")
-    parser.add_argument("--seed", type=not_negative_whole, default=0, help="the number everything random follows from (default: 0)")
+    parser.add_argument("--seed", type=seed_number, default=0, help="the number everything random follows from (default: 0)")
     parser.add_argument("--num-envs", type=positive_whole, help="environments of each seed, stepped together")
     parser.add_argument(
         "--set", action="append", default=[], metavar="NAME=VALUE", dest="settings", help="a setting of the algorithm; may be repeated"
@@ -209,8 +217,14 @@ def _parse(words: Sequence[str]) -> Namespace:
     return parser.parse(words)
 
 
-def _check_output(output: Path) -> None:
-    nearest = next(folder for folder in (output.absolute(), *output.absolute().parents) if folder.exists())
+def check_output(output: Path) -> None:
+    """Raises UserError if no folder can be made there."""
+    try:
+        os.lstat(output)
+    except OSError as error:
+        if error.errno == errno.ENAMETOOLONG:
+            raise UserError(f"--output {output}: no folder can have so long a name; choose another") from None
+    nearest = next(folder for folder in (output.absolute(), *output.absolute().parents) if exists(folder))
     if not nearest.is_dir() or not os.access(nearest, os.W_OK | os.X_OK):
         what = "is not a folder" if not nearest.is_dir() else "may not be written to"
         raise UserError(f"--output {output}: {nearest} {what}; choose another folder")
@@ -219,5 +233,6 @@ def _check_output(output: Path) -> None:
 def _literal(text: str) -> object:
     try:
         return ast.literal_eval(text)
-    except (ValueError, SyntaxError):
+    except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError):
+        # All that Python's reader raises for what is no literal: the last two for what is nested too deeply, TypeError for `{[]: 1}`.
         return text

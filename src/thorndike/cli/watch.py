@@ -8,8 +8,9 @@ from pathlib import Path
 
 from thorndike.cli.answer import Answer
 from thorndike.cli.find_run import add_run_arguments, find_run
-from thorndike.cli.parser import Parser, not_negative_whole, positive_whole
+from thorndike.cli.parser import Parser, positive_whole, seed_number
 from thorndike.errors import UserError
+from thorndike.records import from_policy, read_policy_facts
 
 EXAMPLES = """\
   thorndike watch latest                       a window; without a display, an mp4 in the run's videos/
@@ -23,13 +24,15 @@ def run(words: Sequence[str]) -> Answer:
     parser.add_argument("--video", metavar="FILE.mp4", type=Path, help="write a film there (default without a display: RUN/videos/)")
     parser.add_argument("--window", action="store_true", help="open a window even if no display was found")
     parser.add_argument("--episodes", type=positive_whole, default=1, help="episodes to show (default: 1)")
-    parser.add_argument("--seed", type=not_negative_whole, default=0, help="the number the episodes follow from (default: 0)")
+    parser.add_argument("--seed", type=seed_number, default=0, help="the number the episodes follow from (default: 0)")
     options = parser.parse(words)
     if options.video is not None and options.video.suffix != ".mp4":
         raise UserError(f"--video {options.video}: a film is written as .mp4")
     if options.video is not None and options.window:
         raise UserError("--video and --window: choose one of them")
     directory = find_run(options.run, options.output)
+    # JAX is not imported yet: a policy that is damaged, or not there, is told of at once.
+    from_policy(directory, read_policy_facts)
     path = options.video
     if path is None and not options.window and not has_display():
         path = next_video(directory)

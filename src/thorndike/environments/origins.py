@@ -7,6 +7,7 @@ import copy
 import importlib
 import importlib.util
 import sys
+import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import ModuleType
@@ -23,13 +24,25 @@ Settings: TypeAlias = Mapping[str, object]
 
 
 def is_known_id(name: str) -> bool:
-    """Whether Gymnasium has this id, after importing the module of ``module:Id`` or Atari's package for ``ALE/...``."""
+    """Whether Gymnasium has this id, after importing the module of ``module:Id`` or the package of ``ALE/...`` or ``MinAtar/...``."""
     module, _, id = name.rpartition(":")
     if module:
         _import(module, name)
     elif id.startswith("ALE/") and importlib.util.find_spec("ale_py") is not None:
         gymnasium.register_envs(importlib.import_module("ale_py"))
+    elif id.startswith("MinAtar/") and id not in gymnasium.registry and importlib.util.find_spec("minatar") is not None:
+        # Not by itself when Gymnasium starts: it brings Matplotlib, Seaborn and pandas.
+        importlib.import_module("minatar.gym").register_envs()
     return id in gymnasium.registry
+
+
+def missing_package(id: str) -> str | None:
+    """What to install for an id whose package is not there, in one line; None if nothing is missing."""
+    if id.startswith("ALE/") and importlib.util.find_spec("ale_py") is None:
+        return f"{id} needs the Atari package: pip install 'thorndike[atari]'"
+    if id.startswith("MinAtar/") and importlib.util.find_spec("minatar") is None:
+        return f"{id} trains without it, but is evaluated and filmed on the package minatar: pip install 'thorndike[minatar]'"
+    return None
 
 
 def make_single(
@@ -95,15 +108,26 @@ def _from_name(name: str, env_kwargs: Settings, max_episode_steps: int | None, r
     module, _, id = name.rpartition(":")
     if not is_known_id(name) and module:
         return _limited(_called(_attribute(_import(module, name), id, name), env_kwargs, render_mode, name), max_episode_steps)
+    missing = missing_package(id)
+    if missing is not None:
+        raise UserError(missing)
     settings = dict(env_kwargs)
     if render_mode is not None:
         settings["render_mode"] = render_mode
     try:
-        # Without the checker that looks at every step: it is for writing environments, not for training in them.
-        return gymnasium.make(id, max_episode_steps=max_episode_steps, disable_env_checker=True, **settings)
+        with warnings.catch_warnings():
+            # MinAtar's versions are sets of actions; none of them is out of date.
+            warnings.filterwarnings("ignore", message=".*MinAtar/.* is out of date", category=DeprecationWarning)
+            # Without the checker that looks at every step: it is for writing environments, not for training in them.
+            made = gymnasium.make(id, max_episode_steps=max_episode_steps, disable_env_checker=True, **settings)
     except Exception as error:
         # Whatever an environment's constructor raises is about what was asked of it.
         raise UserError(f"Gymnasium cannot make {name}: {type(error).__name__}: {_one_line(error)}") from error
+    if id.startswith("MinAtar/") and render_mode == "rgb_array":
+        from thorndike.environments.magnified import Magnified
+
+        return Magnified(made)
+    return made
 
 
 def _called(make: Callable[..., gymnasium.Env], env_kwargs: Settings, render_mode: str | None, name: str) -> gymnasium.Env:
@@ -160,7 +184,7 @@ def _load(path: Path) -> ModuleType:
     sys.modules[name] = module
     try:
         spec.loader.exec_module(module)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         del sys.modules[name]
         raise UserError(f"{path} cannot be imported: {type(error).__name__}: {_one_line(error)}") from error
     return module
@@ -171,6 +195,9 @@ def _import(module: str, name: str) -> ModuleType:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:
         raise UserError(f"cannot import {module} of {name}: {_one_line(error)}; install it, or give path/to/file.py:ClassName") from error
+    except (Exception, SystemExit) as error:
+        # Whatever a module raises, or its name, is about what was asked for.
+        raise UserError(f"{module} of {name} cannot be imported: {type(error).__name__}: {_one_line(error)}") from error
 
 
 def _attribute(module: ModuleType, attribute: str, name: str) -> Callable[..., gymnasium.Env]:
@@ -183,5 +210,5 @@ def _attribute(module: ModuleType, attribute: str, name: str) -> Callable[..., g
     return found
 
 
-def _one_line(error: Exception) -> str:
+def _one_line(error: BaseException) -> str:
     return " ".join(str(error).split())

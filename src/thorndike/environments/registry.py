@@ -11,7 +11,6 @@ The order, with ``engine="auto"``:
 Nothing heavy is imported at the top: a wrong id is rejected before JAX is.
 """
 
-import importlib.util
 import inspect
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -19,7 +18,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 from thorndike.environments.host.envpool_ids import SAME_AS_GYMNASIUM, pool_ids, pool_is_installed
-from thorndike.environments.native import NATIVE, factory
+from thorndike.environments.native import NATIVE, factory, settings_of
 from thorndike.errors import UserError
 from thorndike.suggestions import did_you_mean, nearest
 
@@ -250,9 +249,11 @@ def _build_pool(choice: Choice, num_envs: int) -> "EnvPoolEngine":
 
 
 def _accepts(id: str, settings: dict[str, object]) -> bool:
-    """Whether the native factory takes these settings. The factory's file, and so JAX, is imported only if there are any."""
+    """Whether the native factory takes these settings. Its file, and so JAX, is imported only if it may."""
     if not settings:
         return True
+    if not settings.keys() <= settings_of(id):
+        return False
     try:
         inspect.signature(factory(id)).bind(**settings)
     except TypeError:
@@ -285,11 +286,12 @@ def _automatic_pool_ids() -> frozenset[str]:
 
 
 def _unknown(name: str, engine: str) -> str:
-    from thorndike.environments.origins import gymnasium
+    from thorndike.environments.origins import gymnasium, missing_package
 
     close = nearest(name, {*NATIVE, *pool_ids(), *gymnasium.registry})
-    if name.startswith("ALE/") and importlib.util.find_spec("ale_py") is None:
-        return f"{name} needs the Atari package: pip install 'thorndike[atari]'"
+    missing = missing_package(name)
+    if missing is not None and (close == name or name.startswith("ALE/")):
+        return missing
     if close == name:
         return f"{name} does not run on engine={engine!r}: use engine='auto'"
     hint = f"did you mean {close!r}?" if close else "give a Gymnasium id, module:Id or path/to/file.py:ClassName"

@@ -3,6 +3,8 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from thorndike.types import Number
+
 
 def weighted_mean(x: Float[Array, "*B"], weight: Float[Array, "*B"]) -> Float[Array, ""]:
     """Mean of ``x`` over the rows of non-zero ``weight``; 0 if there is none."""
@@ -10,7 +12,7 @@ def weighted_mean(x: Float[Array, "*B"], weight: Float[Array, "*B"]) -> Float[Ar
 
 
 def clipped_surrogate(
-    log_ratio: Float[Array, "*B"], advantage: Float[Array, "*B"], clip_range: Float[Array, ""] | float, weight: Float[Array, "*B"]
+    log_ratio: Float[Array, "*B"], advantage: Float[Array, "*B"], clip_range: Number, weight: Float[Array, "*B"]
 ) -> Float[Array, ""]:
     """PPO's pessimistic surrogate, as a loss. Schulman et al. 2017 (arXiv:1707.06347), eq. 7.
 
@@ -25,7 +27,7 @@ def value_loss(
     value: Float[Array, "*B"],
     old_value: Float[Array, "*B"],
     target: Float[Array, "*B"],
-    clip_range_vf: float | None,
+    clip_range_vf: Number | None,
     weight: Float[Array, "*B"],
 ) -> Float[Array, ""]:
     """Squared error of the value, with PPO2's clipping around the old value if ``clip_range_vf`` is given."""
@@ -40,7 +42,7 @@ def approximate_kl(log_ratio: Float[Array, "*B"], weight: Float[Array, "*B"]) ->
     return weighted_mean(jnp.expm1(log_ratio) - log_ratio, weight)
 
 
-def clip_fraction(log_ratio: Float[Array, "*B"], clip_range: Float[Array, ""] | float, weight: Float[Array, "*B"]) -> Float[Array, ""]:
+def clip_fraction(log_ratio: Float[Array, "*B"], clip_range: Number, weight: Float[Array, "*B"]) -> Float[Array, ""]:
     """Share of rows whose probability ratio left ``[1 - clip_range, 1 + clip_range]``."""
     outside = jnp.abs(jnp.expm1(log_ratio)) > clip_range
     return weighted_mean(outside.astype(log_ratio.dtype), weight)

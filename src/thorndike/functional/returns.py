@@ -4,9 +4,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from thorndike.types import Number
+
 
 def discounted_returns(
-    reward: Float[Array, "T *B"], done: Bool[Array, "T *B"], bootstrap: Float[Array, "T *B"], gamma: float
+    reward: Float[Array, "T *B"], done: Bool[Array, "T *B"], bootstrap: Float[Array, "T *B"], gamma: Number
 ) -> Float[Array, "T *B"]:
     """Discounted return of every step, restarted where an episode ended.
 
@@ -29,8 +31,8 @@ def generalized_advantage(
     next_value: Float[Array, "T *B"],
     terminated: Bool[Array, "T *B"],
     done: Bool[Array, "T *B"],
-    gamma: float,
-    gae_lambda: float,
+    gamma: Number,
+    gae_lambda: Number,
 ) -> Float[Array, "T *B"]:
     """Generalised advantage estimates.
 
@@ -50,7 +52,7 @@ def generalized_advantage(
 
 
 def n_step_return(
-    reward: Float[Array, "n *B"], terminated: Bool[Array, "n *B"], done: Bool[Array, "n *B"], gamma: float
+    reward: Float[Array, "n *B"], terminated: Bool[Array, "n *B"], done: Bool[Array, "n *B"], gamma: Number
 ) -> tuple[Float[Array, "*B"], Float[Array, "*B"], Array]:
     """Sum of up to ``n`` discounted rewards that stops where the episode ends.
 
@@ -65,3 +67,27 @@ def n_step_return(
     last = jnp.sum(alive, axis=0, dtype=jnp.int32) - 1
     discount = gamma ** (last + 1).astype(reward.dtype)
     return total, jnp.where(jnp.any(alive & terminated, axis=0), 0.0, discount), last
+
+
+def lambda_return(
+    reward: Float[Array, "T *B"],
+    next_value: Float[Array, "T *B"],
+    terminated: Bool[Array, "T *B"],
+    done: Bool[Array, "T *B"],
+    gamma: Number,
+    trace_decay: Number,
+) -> Float[Array, "T *B"]:
+    """``G_t = r_t + gamma ((1 - lambda) v(s_t+1) + lambda G_t+1)``; where an episode or the rollout ends, the value alone.
+
+    ``next_value`` is the value of the *true* successor of each step; only ``terminated`` removes it. With the best action's value this is
+    Peng's Q(lambda), which does not stop at exploring actions. Sutton and Barto 2018, eq. 12.18; Peng and Williams 1996.
+    """
+
+    def backward(following: Float[Array, "*B"], row: tuple[Array, Array, Array, Array]) -> tuple[Array, Array]:
+        reward_t, value_t, terminated_t, done_t = row
+        mixed = jnp.where(done_t, value_t, value_t + trace_decay * (following - value_t))
+        current = reward_t + gamma * jnp.where(terminated_t, 0.0, mixed)
+        return current, current
+
+    _, returns = jax.lax.scan(backward, next_value[-1], (reward, next_value, terminated, done), reverse=True, unroll=8)
+    return returns

@@ -8,16 +8,18 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Num
 
+from thorndike.types import Number
+
 
 def bootstrap(
-    reward: Float[Array, "*batch"], terminated: Bool[Array, "*batch"], next_value: Float[Array, "*batch"], gamma: float
+    reward: Float[Array, "*batch"], terminated: Bool[Array, "*batch"], next_value: Float[Array, "*batch"], gamma: Number
 ) -> Float[Array, "*batch"]:
     """Reward plus the discounted value of the successor, which is 0 where the task ended: ``r + gamma * (1 - terminated) * v'``."""
     return reward + gamma * jnp.where(terminated, 0.0, next_value)
 
 
 def q_learning_target(
-    reward: Float[Array, "*batch"], terminated: Bool[Array, "*batch"], next_q: Float[Array, "*batch actions"], gamma: float
+    reward: Float[Array, "*batch"], terminated: Bool[Array, "*batch"], next_q: Float[Array, "*batch actions"], gamma: Number
 ) -> Float[Array, "*batch"]:
     """``r + gamma * max_a Q(s', a)`` (Watkins 1989; Sutton and Barto 2018, equation 6.8)."""
     return bootstrap(reward, terminated, next_q.max(axis=-1), gamma)
@@ -28,7 +30,7 @@ def sarsa_target(
     terminated: Bool[Array, "*batch"],
     next_q: Float[Array, "*batch actions"],
     next_action: Int[Array, "*batch"],
-    gamma: float,
+    gamma: Number,
 ) -> Float[Array, "*batch"]:
     """``r + gamma * Q(s', a')`` with the action taken next (Rummery and Niranjan 1994; Sutton and Barto 2018, equation 6.7)."""
     return bootstrap(reward, terminated, select(next_q, next_action), gamma)
@@ -39,7 +41,7 @@ def expected_sarsa_target(
     terminated: Bool[Array, "*batch"],
     next_q: Float[Array, "*batch actions"],
     epsilon: Float[Array, "*batch"],
-    gamma: float,
+    gamma: Number,
 ) -> Float[Array, "*batch"]:
     """``r + gamma * E Q(s', .)`` under the epsilon-greedy policy (van Seijen et al. 2009; Sutton and Barto 2018, equation 6.9)."""
     expected = (1.0 - epsilon) * next_q.max(axis=-1) + epsilon * next_q.mean(axis=-1)
@@ -51,7 +53,7 @@ def double_q_target(
     terminated: Bool[Array, "*batch"],
     next_q_select: Float[Array, "*batch actions"],
     next_q_evaluate: Float[Array, "*batch actions"],
-    gamma: float,
+    gamma: Number,
 ) -> Float[Array, "*batch"]:
     """``r + gamma * Q_b(s', argmax_a Q_a(s', a))``: one table chooses, the other evaluates (van Hasselt 2010; arXiv:1509.06461)."""
     return bootstrap(reward, terminated, select(next_q_evaluate, next_q_select.argmax(axis=-1)), gamma)

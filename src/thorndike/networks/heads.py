@@ -11,9 +11,9 @@ from jaxtyping import Array, Float
 from thorndike.functional.action_distributions import ActionDistribution
 from thorndike.networks.masking import masked
 from thorndike.networks.network import Network, NetworkBuilder
-from thorndike.networks.recurrent import Remembering, remembering
+from thorndike.networks.recurrent import Remembering, remembering, side_by_side
 from thorndike.networks.torso import MLP, Torso, is_image, torch_uniform
-from thorndike.types import EnvSpec, Observation
+from thorndike.types import EnvSpec, Number, Observation
 
 
 class ActorCritic(nn.Module):
@@ -24,7 +24,7 @@ class ActorCritic(nn.Module):
     free_parameters: int
     hidden: Sequence[int]
     activation: str
-    log_std_init: float
+    log_std_init: Number
 
     @nn.compact
     def __call__(self, obs: Observation) -> tuple[Float[Array, "B P"], Float[Array, " B"]]:
@@ -45,73 +45,116 @@ class ActorCritic(nn.Module):
         return parameters, value[..., 0]
 
 
-class PolicyAndValue(nn.Module):
-    """Policy parameters ``[B, P]`` and a value ``[B]`` from the same features: the head of a network with memory."""
+class PolicyHead(nn.Module):
+    """Policy parameters ``[B, P]`` from features."""
 
     outputs: int
     free_parameters: int
-    log_std_init: float
+    log_std_init: Number
+
+    @nn.compact
+    def __call__(self, features: Float[Array, "B F"]) -> Float[Array, "B P"]:
+        """Features to policy parameters."""
+        parameters = nn.Dense(self.outputs, kernel_init=nn.initializers.orthogonal(0.01), name="policy")(features)
+        if not self.free_parameters:
+            return parameters
+        log_std = self.param("log_std", nn.initializers.constant(self.log_std_init), (self.free_parameters,))
+        return jnp.concatenate([parameters, jnp.broadcast_to(log_std, (*parameters.shape[:-1], self.free_parameters))], axis=-1)
+
+
+class ValueHead(nn.Module):
+    """A value ``[B]`` from features."""
+
+    @nn.compact
+    def __call__(self, features: Float[Array, "B F"]) -> Float[Array, " B"]:
+        """Features to a value."""
+        return nn.Dense(1, kernel_init=nn.initializers.orthogonal(1.0), name="value")(features)[..., 0]
+
+
+class PolicyAndValue(nn.Module):
+    """Both from the same features: the head of a network that sees images and has a memory."""
+
+    outputs: int
+    free_parameters: int
+    log_std_init: Number
 
     @nn.compact
     def __call__(self, features: Float[Array, "B F"]) -> tuple[Float[Array, "B P"], Float[Array, " B"]]:
         """Features to policy parameters and value."""
-        parameters = nn.Dense(self.outputs, kernel_init=nn.initializers.orthogonal(0.01), name="policy")(features)
-        value = nn.Dense(1, kernel_init=nn.initializers.orthogonal(1.0), name="value")(features)
-        if self.free_parameters:
-            log_std = self.param("log_std", nn.initializers.constant(self.log_std_init), (self.free_parameters,))
-            spread = jnp.broadcast_to(log_std, (*parameters.shape[:-1], self.free_parameters))
-            parameters = jnp.concatenate([parameters, spread], axis=-1)
-        return parameters, value[..., 0]
+        return PolicyHead(self.outputs, self.free_parameters, self.log_std_init)(features), ValueHead()(features)
 
 
 class QHead(nn.Module):
-    """Q-values ``[B, A]`` from features; ``dueling`` as in ``QValues``."""
+    """Q-values ``[B, A]`` from features; ``dueling`` and ``outputs`` as in ``QValues``."""
 
     actions: int
     dueling: bool
+    outputs: int = 1
 
     @nn.compact
     def __call__(self, features: Float[Array, "B F"]) -> Float[Array, "B A"]:
         """Features to one value an action."""
-        advantage = nn.Dense(self.actions, kernel_init=torch_uniform, name="q")(features)
+        advantage = nn.Dense(self.actions * self.outputs, kernel_init=torch_uniform, name="q")(features)
         if not self.dueling:
             return advantage
-        value = nn.Dense(1, kernel_init=torch_uniform, name="value")(features)
-        return value + advantage - jnp.mean(advantage, axis=-1, keepdims=True)
+        return combined(nn.Dense(self.outputs, kernel_init=torch_uniform, name="value")(features), advantage)
 
 
 class QValues(nn.Module):
-    """Q-values ``[B, A]``; ``dueling`` splits them into value and advantages (Wang et al. 2016, arXiv:1511.06581, eq. 9)."""
+    """Q-values ``[B, A]``; ``dueling`` splits them into value and advantages (Wang et al. 2016, arXiv:1511.06581, eq. 9).
+
+    Where ``outputs`` numbers describe an action, they stand one action after another: ``[B, A * outputs]``.
+    """
 
     space: gymnasium.Space
     actions: int
     hidden: Sequence[int]
     activation: str
     dueling: bool
+    outputs: int = 1
+    layer_norm: bool = False
 
     @nn.compact
     def __call__(self, obs: Observation) -> Float[Array, "B A"]:
         """Observation ``[B, ...]`` to one value an action."""
         shared = self.hidden[:-1] if self.dueling else self.hidden
-        features = Torso(self.space, shared, self.activation, torch_uniform, name="torso")(obs)
+        features = Torso(self.space, shared, self.activation, torch_uniform, self.layer_norm, name="torso")(obs)
         if not self.dueling:
-            return nn.Dense(self.actions, kernel_init=torch_uniform, name="q")(features)
-        last = self.hidden[-1:]
-        value = MLP(last, self.activation, torch_uniform, outputs=1, name="value")(features)
-        advantage = MLP(last, self.activation, torch_uniform, outputs=self.actions, name="advantage")(features)
+            return nn.Dense(self.actions * self.outputs, kernel_init=torch_uniform, name="q")(features)
+        return combined(self._stream(features, 1, "value"), self._stream(features, self.actions, "advantage"))
+
+    def _stream(self, features: Float[Array, "B F"], rows: int, name: str) -> Float[Array, "B G"]:
+        outputs = rows * self.outputs
+        return MLP(self.hidden[-1:], self.activation, torch_uniform, outputs=outputs, layer_norm=self.layer_norm, name=name)(features)
+
+
+def combined(value: Float[Array, "*B K"], advantage: Float[Array, "*B AK"]) -> Float[Array, "*B AK"]:
+    """Value plus advantages less their mean, for each of the ``K`` numbers that describe an action."""
+    outputs = value.shape[-1]
+    if outputs == 1:
         return value + advantage - jnp.mean(advantage, axis=-1, keepdims=True)
+    rows = advantage.reshape((*advantage.shape[:-1], -1, outputs))
+    return (value[..., None, :] + rows - jnp.mean(rows, axis=-2, keepdims=True)).reshape(advantage.shape)
 
 
 def actor_critic(
-    space: gymnasium.Space, outputs: int, free_parameters: int, hidden: Sequence[int], activation: str, log_std_init: float = 0.0
+    space: gymnasium.Space, outputs: int, free_parameters: int, hidden: Sequence[int], activation: str, log_std_init: Number = 0.0
 ) -> Network:
     """A policy and its value. ``outputs`` is ``P`` less the ``free_parameters`` that do not depend on the observation."""
     return _pair(ActorCritic(space, outputs, free_parameters, tuple(hidden), activation, log_std_init))
 
 
-def q_values(space: gymnasium.Space, actions: int, hidden: Sequence[int], activation: str, dueling: bool = False) -> Network:
-    """Q-values of every action."""
-    return _pair(QValues(space, actions, tuple(hidden), activation, dueling))
+def q_values(
+    space: gymnasium.Space,
+    actions: int,
+    hidden: Sequence[int],
+    activation: str,
+    dueling: bool = False,
+    outputs: int = 1,
+    layer_norm: bool = False,
+) -> Network:
+    """Q-values of every action, or ``outputs`` numbers of each."""
+    return _pair(QValues(space, actions, tuple(hidden), activation, dueling, outputs, layer_norm))
 
 
 class Shape(NamedTuple):
@@ -122,27 +165,38 @@ class Shape(NamedTuple):
     memory: str = "none"
     """``none``, ``gru`` or ``lstm``."""
     memory_size: int = 64
+    layer_norm: bool = False
+    """Normalise each hidden layer before its activation; for Q-values without memory."""
 
 
 def policy_network(
-    spec: EnvSpec, distribution: ActionDistribution, shape: Shape, log_std_init: float, given: NetworkBuilder | None = None
+    spec: EnvSpec, distribution: ActionDistribution, shape: Shape, log_std_init: Number, given: NetworkBuilder | None = None
 ) -> Network:
     """A policy and its value for an environment, masks honoured; the user's own if one is ``given``."""
     if given is not None:
         return masked(given(spec, distribution.network_outputs + distribution.free_parameters), spec)
-    outputs, free = distribution.network_outputs, distribution.free_parameters
+    outputs, free, hidden_init = distribution.network_outputs, distribution.free_parameters, nn.initializers.orthogonal(2.0**0.5)
     if shape.memory == "none":
         return masked(actor_critic(spec.observation_space, outputs, free, shape.net_arch, shape.activation, log_std_init), spec)
-    return masked(_remembering(spec, shape, nn.initializers.orthogonal(2.0**0.5), PolicyAndValue(outputs, free, log_std_init)), spec)
+    if is_image(spec.observation_space):
+        return masked(_remembering(spec, shape, hidden_init, PolicyAndValue(outputs, free, log_std_init)), spec)
+    # One memory for both would be shaped by the value's gradient, which is far larger: the policy then learns nothing (measured).
+    policy = _remembering(spec, shape, hidden_init, PolicyHead(outputs, free, log_std_init))
+    return masked(side_by_side(policy, _remembering(spec, shape, hidden_init, ValueHead())), spec)
 
 
 def q_network(spec: EnvSpec, actions: int, shape: Shape, dueling: bool, given: NetworkBuilder | None = None) -> Network:
     """Q-values of every action, masks honoured; the user's own network if one is ``given``."""
+    return masked(q_outputs(spec, actions, shape, dueling, 1, given), spec)
+
+
+def q_outputs(spec: EnvSpec, actions: int, shape: Shape, dueling: bool, outputs: int, given: NetworkBuilder | None = None) -> Network:
+    """``outputs`` numbers for each action, one action after another, whatever the masks; the user's own network if one is ``given``."""
     if given is not None:
-        return masked(given(spec, actions), spec)
+        return given(spec, actions * outputs)
     if shape.memory == "none":
-        return masked(q_values(spec.observation_space, actions, shape.net_arch, shape.activation, dueling), spec)
-    return masked(_remembering(spec, shape, torch_uniform, QHead(actions, dueling)), spec)
+        return q_values(spec.observation_space, actions, shape.net_arch, shape.activation, dueling, outputs, shape.layer_norm)
+    return _remembering(spec, shape, torch_uniform, QHead(actions, dueling, outputs))
 
 
 def _remembering(spec: EnvSpec, shape: Shape, kernel_init: Callable[..., Array], head: nn.Module) -> Network:

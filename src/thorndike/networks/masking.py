@@ -13,7 +13,7 @@ from gymnasium import spaces
 from jaxtyping import Array, Bool, Float, PyTree
 
 from thorndike.errors import UserError
-from thorndike.networks.network import Network, Recurrence
+from thorndike.networks.network import Network, with_outputs
 from thorndike.types import EnvSpec, Observation
 
 MASK = "action_mask"
@@ -55,7 +55,7 @@ def masked(network: Network, spec: EnvSpec) -> Network:
     """
     if not has_mask(spec.observation_space):
         return network
-    sizes = _check_mask(spec)
+    sizes = check_mask(spec)
 
     def mask(outputs: PyTree, obs: Observation) -> PyTree:
         if isinstance(outputs, tuple):
@@ -67,26 +67,16 @@ def masked(network: Network, spec: EnvSpec) -> Network:
         open_ = jnp.concatenate([part | ~jnp.any(part, axis=-1, keepdims=True) for part in parts], axis=-1)
         return jnp.where(open_, values, FORBIDDEN)
 
-    def apply(params: PyTree, obs: Observation) -> PyTree:
-        return mask(network.apply(params, obs), obs)
-
-    if network.recurrence is None:
-        return network._replace(apply=apply)
-    inner = network.recurrence
-
-    def step(params: PyTree, memory: PyTree, obs: Observation) -> tuple[PyTree, PyTree]:
-        memory, outputs = inner.step(params, memory, obs)
-        return memory, mask(outputs, obs)
-
-    def unroll(params: PyTree, memory: PyTree, obs: Observation, begins: Bool[Array, "T B"]) -> tuple[PyTree, PyTree]:
-        memories, outputs = inner.unroll(params, memory, obs, begins)
-        return memories, mask(outputs, obs)
-
-    return Network(network.init, apply, Recurrence(inner.fresh, step, unroll))
+    return with_outputs(network, mask)
 
 
-def _check_mask(spec: EnvSpec) -> list[int]:
-    """How many entries of the mask belong to each component of an action."""
+def hide_forbidden(q: Float[Array, "*B A"], space: gymnasium.Space, obs: Observation) -> Float[Array, "*B A"]:
+    """Q-values with those of forbidden actions at ``FORBIDDEN``; as they are where observations bring no mask."""
+    return jnp.where(allowed(obs), q, FORBIDDEN) if has_mask(space) else q
+
+
+def check_mask(spec: EnvSpec) -> list[int]:
+    """How many entries of the mask belong to each component of an action. Raises ``UserError`` if it does not fit the actions."""
     actions, came = spec.action_space, _mask_space(spec.observation_space).shape
     if isinstance(actions, spaces.Discrete):
         sizes = [int(actions.n)]

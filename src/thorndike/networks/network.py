@@ -77,6 +77,27 @@ def apply_rollout(network: Network, params: PyTree, rollout: Rollout) -> tuple[P
     return outputs, jax.tree.map(as_time, following)
 
 
+def with_outputs(network: Network, change: Callable[[PyTree, Observation], PyTree]) -> Network:
+    """The same network with its outputs changed: ``change(outputs, obs)``."""
+
+    def apply(params: PyTree, obs: Observation) -> PyTree:
+        return change(network.apply(params, obs), obs)
+
+    if network.recurrence is None:
+        return network._replace(apply=apply)
+    inner = network.recurrence
+
+    def step(params: PyTree, memory: PyTree, obs: Observation) -> tuple[PyTree, PyTree]:
+        memory, outputs = inner.step(params, memory, obs)
+        return memory, change(outputs, obs)
+
+    def unroll(params: PyTree, memory: PyTree, obs: Observation, begins: Bool[Array, "T B"]) -> tuple[PyTree, PyTree]:
+        memories, outputs = inner.unroll(params, memory, obs, begins)
+        return memories, change(outputs, obs)
+
+    return Network(network.init, apply, Recurrence(inner.fresh, step, unroll))
+
+
 def as_rows(tree: PyTree) -> PyTree:
     """Leaves ``[T, B, ...]`` as ``[T * B, ...]``."""
     return jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), tree)

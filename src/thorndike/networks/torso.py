@@ -13,6 +13,9 @@ from thorndike.errors import UserError
 from thorndike.networks.masking import observed, without_mask
 from thorndike.types import Observation
 
+LARGE_IMAGE = 36
+"""Pixels of the shorter side from which Mnih et al.'s three convolutions fit."""
+
 ACTIVATIONS: dict[str, Callable[[Array], Array]] = {"tanh": nn.tanh, "relu": nn.relu, "gelu": nn.gelu, "silu": nn.silu}
 
 torch_uniform = nn.initializers.variance_scaling(1.0 / 3.0, "fan_in", "uniform")
@@ -27,33 +30,71 @@ class MLP(nn.Module):
     kernel_init: Callable[..., Array]
     outputs: int | None = None
     output_init: Callable[..., Array] | None = None
+    layer_norm: bool = False
+    """Normalise each hidden layer before its activation (Ba et al. 2016, arXiv:1607.06450)."""
 
     @nn.compact
     def __call__(self, x: Float[Array, "*B F"]) -> Float[Array, "*B G"]:
         """Features to features, or to ``outputs`` numbers."""
         for width in self.hidden:
-            x = ACTIVATIONS[self.activation](nn.Dense(width, kernel_init=self.kernel_init)(x))
+            x = nn.Dense(width, kernel_init=self.kernel_init)(x)
+            x = ACTIVATIONS[self.activation](nn.LayerNorm()(x) if self.layer_norm else x)
         if self.outputs is None:
             return x
         return nn.Dense(self.outputs, kernel_init=self.output_init or self.kernel_init)(x)
 
 
-class CNN(nn.Module):
-    """Convolutions over an image ``[B, H, W, C]`` (NHWC) to features: Mnih et al. 2015's on large images, one 3 x 3 layer on small ones."""
+class SmallConvolution(nn.Module):
+    """A 3 x 3 convolution without padding, with the parameters of ``nn.Conv``, as one matrix product over patches.
 
-    features: int
+    In a compiled loop on a CPU, XLA's own convolution takes 1.4 s for the gradient of 2,048 MinAtar boards, this 0.06 s, and 2.1 ms and
+    0.8 ms for 32 (one core, the dense layer of 128 included).
+    """
+
+    channels: int
     kernel_init: Callable[..., Array]
 
     @nn.compact
+    def __call__(self, image: Float[Array, "B H W C"]) -> Float[Array, "B H2 W2 D"]:
+        """Image to ``channels`` numbers at every place but the border."""
+        size, height, width, depth = 3, image.shape[1] - 2, image.shape[2] - 2, image.shape[3]
+        kernel = self.param("kernel", self.kernel_init, (size, size, depth, self.channels))
+        bias = self.param("bias", nn.initializers.zeros_init(), (self.channels,))
+        shifted = [image[:, i : i + height, j : j + width] for i in range(size) for j in range(size)]
+        patches = jnp.concatenate(shifted, axis=-1).reshape(-1, size * size * depth)
+        found = patches @ kernel.reshape(size * size * depth, self.channels) + bias[None]
+        return found.reshape(image.shape[0], height, width, self.channels)
+
+
+class CNN(nn.Module):
+    """Convolutions over an image ``[B, H, W, C]`` (NHWC), then dense layers, with ReLU after each.
+
+    Large images (36 pixels and more) get the three layers of Mnih et al. 2015, small ones the 3 x 3 layer with 16 channels of Young and
+    Tian 2019 (arXiv:1903.03176), who put a dense layer of 128 after it.
+    """
+
+    hidden: Sequence[int]
+    kernel_init: Callable[..., Array]
+    layer_norm: bool = False
+
+    @nn.compact
     def __call__(self, image: Float[Array, "B H W C"]) -> Float[Array, "B F"]:
-        """Images in [0, 1] to ``features`` numbers."""
-        large = min(image.shape[1:3]) >= 36
-        layers = ((32, 8, 4), (64, 4, 2), (64, 3, 1)) if large else ((16, 3, 1),)
+        """Images in [0, 1] to features."""
         x = image
-        for channels, size, stride in layers:
-            x = nn.relu(nn.Conv(channels, (size, size), (stride, stride), padding="VALID", kernel_init=self.kernel_init)(x))
+        if min(image.shape[1:3]) < LARGE_IMAGE:
+            # The name keeps the parameters where nn.Conv would have them.
+            x = self._activated(SmallConvolution(16, self.kernel_init, name="Conv_0")(x))
+        else:
+            for channels, size, stride in ((32, 8, 4), (64, 4, 2), (64, 3, 1)):
+                convolution = nn.Conv(channels, (size, size), (stride, stride), padding="VALID", kernel_init=self.kernel_init)
+                x = self._activated(convolution(x))
         x = x.reshape((x.shape[0], -1))
-        return nn.relu(nn.Dense(self.features, kernel_init=self.kernel_init)(x))
+        for width in self.hidden:
+            x = self._activated(nn.Dense(width, kernel_init=self.kernel_init)(x))
+        return x
+
+    def _activated(self, x: Float[Array, "*B F"]) -> Float[Array, "*B F"]:
+        return nn.relu(nn.LayerNorm()(x) if self.layer_norm else x)
 
 
 class Torso(nn.Module):
@@ -63,17 +104,18 @@ class Torso(nn.Module):
     hidden: Sequence[int]
     activation: str
     kernel_init: Callable[..., Array]
+    layer_norm: bool = False
 
     @nn.compact
     def __call__(self, obs: Observation) -> Float[Array, "B G"]:
         """Observation ``[B, ...]`` to features ``[B, G]``."""
         space, obs = without_mask(self.space), observed(self.space, obs)
         if not is_image(space):
-            return MLP(self.hidden, self.activation, self.kernel_init)(flatten_observation(space, obs))
+            return MLP(self.hidden, self.activation, self.kernel_init, layer_norm=self.layer_norm)(flatten_observation(space, obs))
         # A trailing axis turns a grey image [B, H, W] into [B, H, W, 1].
         image = obs if obs.ndim == 4 else obs[..., None]
         scaled = image.astype(jnp.float32) / (255.0 if image.dtype == jnp.uint8 else 1.0)
-        return CNN(self.hidden[-1] if self.hidden else 128, self.kernel_init)(scaled)
+        return CNN(self.hidden or (128,), self.kernel_init, self.layer_norm)(scaled)
 
 
 def example_observation(space: gymnasium.Space) -> Observation:

@@ -1,6 +1,5 @@
 """Learning curves of one or several runs, with their 95 % interval over seeds, as PNG, SVG or PDF."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
@@ -12,6 +11,7 @@ from thorndike.errors import UserError
 from thorndike.plotting.style import COLOURS, STYLE, check_plot_file, counted, save_figure, short_number
 from thorndike.statistics.estimates import mean_interval_over_seeds
 from thorndike.suggestions import did_you_mean
+from thorndike.training.json_files import TEXT, blamed_on, check_fields, parse_object, read_object
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -47,11 +47,12 @@ def read_curve(run: Path, metric: str = METRIC) -> Curve:
 
     Raises UserError if the run has logged nothing, or nothing under this name.
     """
-    facts = json.loads((run / "run.json").read_text(encoding="utf-8"))
+    facts = read_object(run / "run.json")
+    check_fields(facts, {"algorithm": TEXT, "environment": TEXT}, run / "run.json")
     path = run / "metrics.jsonl"
     # A run that was killed may have left half a line: whatever no newline ends is not there yet.
-    lines = path.read_text(encoding="utf-8").split("\n")[:-1] if path.is_file() else []
-    rows = [json.loads(line) for line in lines if line]
+    lines = path.read_bytes().split(b"\n")[:-1] if path.is_file() else []
+    rows = [parse_object(line, path) for line in lines if line]
     if not rows:
         raise UserError(f"{run} has logged nothing yet: {path.name} is missing or empty; train longer")
     known = {name for row in rows for name in row if name != "steps"}
@@ -59,13 +60,16 @@ def read_curve(run: Path, metric: str = METRIC) -> Curve:
         raise UserError(f"{run} has no metric '{metric}'{did_you_mean(metric, known)}")
     chosen = [row for row in rows if metric in row]
     # What is measured of the whole run, such as time/fps, is one number and not one a seed.
-    cells = [row[metric] if isinstance(row[metric], list) else [row[metric]] for row in chosen]
-    values = np.array([[np.nan if value is None else value for value in row] for row in cells], np.float64)
-    steps = np.array([row["steps"] for row in chosen], np.float64)
+    with blamed_on(path):
+        cells = [cell if isinstance(cell, list) else [cell] for cell in (row[metric] for row in chosen)]
+        values = np.array([[np.nan if value is None else value for value in row] for row in cells], np.float64)
+        steps = np.array([row["steps"] for row in chosen], np.float64)
     kept = np.isfinite(values).any(axis=1)
     if not kept.any():
         raise UserError(f"{run}: no value of '{metric}' yet, so there is nothing to draw; train longer")
-    return Curve(steps[kept], np.where(np.isfinite(values), values, np.nan)[kept], facts["algorithm"], facts["environment"], run.name)
+    return Curve(
+        steps[kept], np.where(np.isfinite(values), values, np.nan)[kept], str(facts["algorithm"]), str(facts["environment"]), run.name
+    )
 
 
 def plot_learning_curves(curves: Sequence[Curve], path: Path, *, metric: str = METRIC, title: str | None = None) -> Path:

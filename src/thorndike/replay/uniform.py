@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key, PyTree
 
 from thorndike.functional.returns import n_step_return
-from thorndike.types import Action, EnvSpec, Observation, Rollout, Step
+from thorndike.types import Action, EnvSpec, Number, Observation, Rollout, Step
 
 
 class ReplayBuffer(NamedTuple):
@@ -86,14 +86,18 @@ def add(buffer: ReplayBuffer, rollout: Rollout) -> ReplayBuffer:
     )
 
 
-def sample(buffer: ReplayBuffer, key: Key[Array, ""], batch_size: int, num_envs: int, n_step: int, gamma: float) -> Transitions:
+def sample(buffer: ReplayBuffer, key: Key[Array, ""], batch_size: int, num_envs: int, n_step: int, gamma: Number) -> Transitions:
     """Draw ``batch_size`` transitions uniformly with replacement. Consumes the key.
 
     The cost does not grow with the ring's size. With ``n_step > 1`` the newest ``n_step - 1`` steps are not drawn: what follows them is
     not stored yet.
     """
+    return transitions_at(buffer, _draw(buffer, key, batch_size, num_envs, n_step), num_envs, n_step, gamma)
+
+
+def transitions_at(buffer: ReplayBuffer, index: Int[Array, " M"], num_envs: int, n_step: int, gamma: Number) -> Transitions:
+    """The (n-step) transitions that begin at these rows, whose next ``n_step - 1`` steps must be stored."""
     total = jax.tree.leaves(buffer.rows)[0].shape[0]
-    index = _draw(buffer, key, batch_size, num_envs, n_step)
     if n_step == 1:
         row = jax.tree.map(lambda x: x[index], buffer.rows)
         discount = jnp.where(row["terminated"], 0.0, gamma)

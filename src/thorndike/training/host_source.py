@@ -94,7 +94,11 @@ class Tally:
 
 
 def environment_seeds(seed: int, indices: Sequence[int], num_envs: int, stream: int) -> list[int]:
-    """One 31-bit seed for each of ``len(indices) x num_envs`` environments; streams of different arguments never meet."""
+    """One seed for each of ``len(indices) x num_envs`` environments.
+
+    Seeds have 31 bits, the most that every environment takes, and follow from all arguments by hashing: among n of them n^2 / 2^32 pairs
+    are equal by chance.
+    """
     words = [np.random.SeedSequence([seed, index, stream]).generate_state(num_envs) for index in indices]
     return [int(word) >> 1 for word in np.concatenate(words)]
 

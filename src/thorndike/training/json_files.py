@@ -41,6 +41,7 @@ SECONDS = Kind(
     "a number of at least 0",
     lambda value: isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value) and value >= 0,
 )
+NUMBER = Kind("a number", lambda value: type(value) in (int, float))
 OBJECT = Kind("an object", lambda value: isinstance(value, dict))
 OBJECTS = Kind("a list of objects", lambda value: isinstance(value, list) and all(isinstance(part, dict) for part in value))
 

@@ -10,11 +10,13 @@ from thorndike.training.json_files import Json
 
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "numpy", "gymnasium", "thorndike")
 """Those whose version may change the last bits of a run."""
+_VECTORS = ("sse", "avx", "fma", "f16c", "amx", "asimd", "sve", "neon")
 
 
 def machine() -> Json:
-    """The processor, XLA's options, and a hash of what a small program computes here. Starts JAX."""
-    return {"processor": _processor(), "xla_flags": os.environ.get("XLA_FLAGS", ""), "self_test": self_test()}
+    """The processor, what it can do on vectors, XLA's options, and a hash of what a small program computes here. Starts JAX."""
+    flags = os.environ.get("XLA_FLAGS", "")
+    return {"processor": _processor(), "features": _features(), "xla_flags": flags, "self_test": self_test()}
 
 
 def self_test() -> str:
@@ -43,9 +45,20 @@ def differences(before: Mapping[str, object], now: Mapping[str, object]) -> list
         ("XLA_FLAGS", machine.get("xla_flags"), machine_now.get("xla_flags")),
     ]
     found = [f"{name} {here} in place of {there}" for name, there, here in compared if there not in (None, here)]
+    found += _unlike(machine.get("features"), machine_now.get("features"))
     if machine.get("self_test") not in (None, machine_now.get("self_test")):
         found.append("a test computation gives other bits")
     return found
+
+
+def _unlike(before: object, now: object) -> list[str]:
+    """In words, which of a processor's features there were and are not, or the other way round; nothing if they were not recorded."""
+    if before in (None, now):
+        return []
+    there, here = set(str(before).split()), set(str(now).split())
+    lacking, further = " ".join(sorted(there - here)), " ".join(sorted(here - there))
+    parts = [f"lacks {lacking}"] * bool(lacking) + [f"also has {further}"] * bool(further)
+    return [f"the processor {' and '.join(parts)}"]
 
 
 def _mapping(value: object) -> Mapping[str, object]:
@@ -54,8 +67,19 @@ def _mapping(value: object) -> Mapping[str, object]:
 
 def _processor() -> str:
     """The processor's own name, where the system tells it."""
+    return _told("model name") or platform.processor() or platform.machine()
+
+
+def _features() -> str:
+    """The sets of vector instructions that XLA may compile for: of two processors with one name, one may have fewer."""
+    words = (_told("flags") or _told("Features") or "").split()
+    return " ".join(sorted(word for word in words if word.startswith(_VECTORS)))
+
+
+def _told(name: str) -> str | None:
+    """What Linux says of the first processor."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
-        return platform.processor() or platform.machine()
-    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.machine())
+        return None
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith(name)), None)

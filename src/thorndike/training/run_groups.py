@@ -1,11 +1,11 @@
 """Which runs are compared with which, and what was recorded of their evaluations. JSON files only: mistakes must not wait for JAX."""
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
 from thorndike.errors import UserError
+from thorndike.training.json_files import FLAG, NUMBER, OBJECT, TEXT, check_fields, optional, parse_object, whole
 from thorndike.training.run_directory import read_run
 
 RunPath: TypeAlias = str | Path
@@ -13,6 +13,18 @@ Entry: TypeAlias = RunPath | Sequence[RunPath]
 """One run, or several whose seeds count together."""
 
 _STAMP = len("20260101-120000-")
+_FIELDS = {
+    "algorithm": TEXT,
+    "environment": TEXT,
+    "env_kwargs": OBJECT,
+    "max_episode_steps": optional(whole(1)),
+    "config": OBJECT,
+    "seeds": whole(1),
+    "seed": whole(0),
+    "steps": whole(1),
+    "status": TEXT,
+}
+_EVALUATED = {"seed": whole(0), "episode": whole(0), "return": NUMBER, "evaluation_seed": whole(0), "deterministic": FLAG}
 
 
 class Trained(NamedTuple):
@@ -76,6 +88,11 @@ def group_runs(runs: Sequence[Entry] | Mapping[str, Entry], against: RunPath | N
     return Groups(groups, baseline, environments, (*_left_out(entries, environments), *_differences(groups)))
 
 
+def all_trained(found: Groups) -> list[Trained]:
+    """Every run of a comparison."""
+    return [trained for group in found.groups for together in group.runs.values() for trained in together]
+
+
 def recorded_scores(trained: Trained, episodes: int) -> list[float] | None:
     """Each seed's mean return in the last evaluation of ``evaluations.jsonl``; None if it does not count.
 
@@ -106,9 +123,12 @@ def _read_rows(path: Path) -> list[dict]:
     # A process that was killed may have left half a line: whatever no newline ends is not there.
     lines = path.read_text(encoding="utf-8").split("\n")[:-1]
     try:
-        return [json.loads(line) for line in lines]
-    except json.JSONDecodeError as error:
-        raise UserError(f"{path} is damaged ({error}); remove it: the policies are then evaluated anew") from None
+        rows = [parse_object(line.encode(), path) for line in lines]
+        for row in rows:
+            check_fields(row, _EVALUATED, path)
+    except UserError as error:
+        raise UserError(f"{error}; remove it: the policies are then evaluated anew") from None
+    return rows
 
 
 def _read_entry(entry: Entry) -> tuple[Trained, ...]:
@@ -120,6 +140,7 @@ def _read_entry(entry: Entry) -> tuple[Trained, ...]:
 
 def _read_trained(run: Path) -> Trained:
     facts = read_run(run)
+    check_fields(facts, _FIELDS, run / "run.json")
     if not any((run / name).exists() for name in ("policy", "policy.old", "evaluations.jsonl")):
         raise UserError(f"{run} has no trained policy to compare: it has not reached its first checkpoint; train longer")
     changed = {**facts["env_kwargs"], **({"steps at most": facts["max_episode_steps"]} if facts["max_episode_steps"] else {})}

@@ -15,10 +15,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key, PyTree, UInt32
 
 from thorndike.training.host_source import HostSource
-from thorndike.types import Algorithm, EpisodeStats, Rollout, Source
+from thorndike.types import Algorithm, EpisodeStats, Metrics, Rollout, Source
 
 _ROWS_OF_A_PAGE = 1_024
-_RUN_ONCE = {"xla_backend_optimization_level": 0}
+RUN_ONCE = {"xla_backend_optimization_level": 0}
 """For programs that run once: compiling them costs more than running them (measured: 1.2 s in place of 5.3 s)."""
 _CALLS_KERNELS: dict[str, str | bool] = {"xla_backend_optimization_level": "1", "xla_cpu_parallel_codegen_split_count": "1"}
 _ONE_FUNCTION: dict[str, str | bool] = {"xla_cpu_parallel_codegen_split_count": "1"}
@@ -79,6 +79,20 @@ def run_keys(seed: int, indices: UInt32[Array, " S"]) -> Key[Array, " S"]:
     return jax.vmap(lambda index: jax.random.fold_in(jax.random.key(seed), index))(indices)
 
 
+class AgentKeys(NamedTuple):
+    """What all random numbers of an agent follow from, ``[S]``."""
+
+    learner: Key[Array, " S"]
+    source: Key[Array, " S"]
+    loop: Key[Array, " S"]
+
+
+def agent_keys(seed: int, indices: UInt32[Array, " S"]) -> AgentKeys:
+    """The keys of agents ``indices`` of run ``seed``."""
+    keys = jax.vmap(lambda key: jax.random.split(key, 3))(run_keys(seed, indices))
+    return AgentKeys(keys[:, 0], keys[:, 1], keys[:, 2])
+
+
 def runner(algorithm: Algorithm, source: Source | HostSource, seed: int, indices: Sequence[int]) -> Runner:
     """Bind a learner to its source. ``indices`` name the agents of run ``seed``, usually ``range(S)``."""
     plain = source.source if isinstance(source, HostSource) else source
@@ -89,13 +103,13 @@ def runner(algorithm: Algorithm, source: Source | HostSource, seed: int, indices
     warming = make(algorithm, plain, algorithm.observe, spent)
 
     def begin(indices: UInt32[Array, " S"]) -> tuple[Carry, Key[Array, " S"]]:
-        keys = jax.vmap(lambda key: jax.random.split(key, 3))(run_keys(seed, indices))
-        state = jax.vmap(plain.init)(keys[:, 1]) if plain.compiled else ()
-        return Carry(jax.vmap(algorithm.init)(keys[:, 0]), state, keys[:, 2]), keys[:, 1]
+        keys = agent_keys(seed, indices)
+        state = jax.vmap(plain.init)(keys.source) if plain.compiled else ()
+        return Carry(jax.vmap(algorithm.init)(keys.learner), state, keys.loop), keys.source
 
     def init() -> Carry:
         spent.start()
-        carry, source_keys = jax.jit(begin, compiler_options=_RUN_ONCE)(np.asarray(indices, np.uint32))
+        carry, source_keys = jax.jit(begin, compiler_options=RUN_ONCE)(np.asarray(indices, np.uint32))
         if not plain.compiled:
             carry = carry._replace(source=plain.init(source_keys))
         spent.stop()
@@ -226,36 +240,77 @@ def _compiled_segment(
     return run
 
 
+class _Learners(NamedTuple):
+    """How the learners of all seeds are held while a host engine steps."""
+
+    take: Callable[[PyTree], PyTree]
+    """learners as a carry has them -> as they are held."""
+    actors: Callable[[PyTree], PyTree]
+    """-> actors ``[S, ...]``."""
+    learn: Callable[[PyTree, Rollout, Key[Array, " S"]], tuple[PyTree, Metrics]]
+    """held, rollouts ``[S, T, B, ...]``, keys -> held, metrics ``[S]``. What is held is consumed."""
+    give: Callable[[PyTree], PyTree]
+    """-> as a carry has them."""
+
+
+def _stacked(algorithm: Algorithm, learn: Callable) -> _Learners:
+    """One array for all seeds, one program."""
+    return _Learners(
+        take=lambda learner: learner,
+        actors=jax.jit(jax.vmap(algorithm.actor)),
+        learn=jax.jit(over_seeds(learn), donate_argnums=0),
+        give=lambda learner: learner,
+    )
+
+
+def _apart(algorithm: Algorithm, learn: Callable) -> _Learners:
+    """A learner a seed. XLA would copy the replay out of a stack and into it again at every iteration (SAC with 1,000,000 transitions)."""
+    actor = jax.jit(algorithm.actor)
+    learn_one = jax.jit(lambda learner, rollout, keys, i: learn(learner, jax.tree.map(lambda x: x[i], rollout), keys[i]), donate_argnums=0)
+    stack = jax.jit(lambda trees: jax.tree.map(lambda *rows: jnp.stack(rows), *trees))
+
+    def take(learner: PyTree) -> PyTree:
+        seeds = jax.tree.leaves(learner)[0].shape[0]
+        return [jax.tree.map(lambda x, i=i: x[i], learner) for i in range(seeds)]
+
+    def learn_each(held: PyTree, rollout: Rollout, keys: Key[Array, " S"]) -> tuple[PyTree, Metrics]:
+        outcomes = [learn_one(learner, rollout, keys, np.int32(i)) for i, learner in enumerate(held)]
+        return [learner for learner, _ in outcomes], stack([metrics for _, metrics in outcomes])
+
+    return _Learners(take, lambda held: stack([actor(learner) for learner in held]), learn_each, stack)
+
+
 def _host_segment(
     algorithm: Algorithm, source: Source, learn: Callable, spent: Stopwatch
 ) -> Callable[[Carry, int, int], tuple[Carry, Report]]:
     """The same iterations, stepped from Python."""
     page = page_length(algorithm, source.spec.num_envs)
+    held_apart = jax.default_backend() == "cpu" and not algorithm.needs.on_policy
+    learners = (_apart if held_apart else _stacked)(algorithm, learn)
 
-    def prepare(learner: PyTree, loop_key: Key[Array, ""], iteration: Int[Array, ""]) -> tuple[PyTree, PyTree, Key[Array, ""]]:
+    def prepare(loop_key: Key[Array, ""], iteration: Int[Array, ""]) -> tuple[PyTree, Key[Array, ""]]:
         keys = _page_keys(loop_key, iteration // page)
         noise = jax.tree.map(lambda x: x[iteration % page], source.draw(keys.draw, page))
-        return algorithm.actor(learner), noise, jax.random.fold_in(keys.update, iteration % page)
+        return noise, jax.random.fold_in(keys.update, iteration % page)
 
-    prepare_all = jax.jit(jax.vmap(prepare, in_axes=(0, 0, None)))
-    learn_all = jax.jit(over_seeds(learn), donate_argnums=0)
+    prepare_all = jax.jit(jax.vmap(prepare, in_axes=(0, None)))
     seen: list[bool] = []
 
     def run(carry: Carry, first: int, count: int) -> tuple[Carry, Report]:
-        learner, state, loop_keys = carry
+        held, state, loop_keys = learners.take(carry.learner), carry.source, carry.loop_key
         reports: list[Report] = []
         for iteration in range(first, first + count):
             if not seen:
                 spent.start()
-            actor, noise, key = prepare_all(learner, loop_keys, np.int32(iteration))
-            state, rollout, episodes = source.collect(state, actor, noise)
-            learner, metrics = learn_all(learner, rollout, key)
+            noise, keys = prepare_all(loop_keys, np.int32(iteration))
+            state, rollout, episodes = source.collect(state, learners.actors(held), noise)
+            held, metrics = learners.learn(held, rollout, keys)
             reports.append(Report(metrics, episodes))
             if not seen:
                 seen.append(True)
                 spent.stop()
         metrics = jax.tree.map(lambda *rows: sum(rows) / len(rows), *[report.metrics for report in reports])
         episodes = jax.tree.map(lambda *rows: sum(rows), *[report.episodes for report in reports])
-        return Carry(learner, state, loop_keys), Report(metrics, episodes)
+        return Carry(learners.give(held), state, loop_keys), Report(metrics, episodes)
 
     return run

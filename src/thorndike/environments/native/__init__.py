@@ -1,7 +1,9 @@
 """Native environments: compiled JAX dynamics, equal to Gymnasium's step by step; nothing heavy is imported before one is asked for."""
 
+import ast
 import importlib
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
@@ -18,6 +20,16 @@ NATIVE: Mapping[str, str] = MappingProxyType(
         "MountainCarContinuous-v0": "thorndike.environments.native.mountain_car:mountain_car_continuous",
         "Pendulum-v1": "thorndike.environments.native.pendulum:pendulum",
         "Blackjack-v1": "thorndike.environments.native.blackjack:blackjack",
+        "MinAtar/Asterix-v0": "thorndike.environments.native.minatar.asterix:asterix",
+        "MinAtar/Asterix-v1": "thorndike.environments.native.minatar.asterix:asterix_minimal",
+        "MinAtar/Breakout-v0": "thorndike.environments.native.minatar.breakout:breakout",
+        "MinAtar/Breakout-v1": "thorndike.environments.native.minatar.breakout:breakout_minimal",
+        "MinAtar/Freeway-v0": "thorndike.environments.native.minatar.freeway:freeway",
+        "MinAtar/Freeway-v1": "thorndike.environments.native.minatar.freeway:freeway_minimal",
+        "MinAtar/Seaquest-v0": "thorndike.environments.native.minatar.seaquest:seaquest",
+        "MinAtar/Seaquest-v1": "thorndike.environments.native.minatar.seaquest:seaquest_minimal",
+        "MinAtar/SpaceInvaders-v0": "thorndike.environments.native.minatar.space_invaders:space_invaders",
+        "MinAtar/SpaceInvaders-v1": "thorndike.environments.native.minatar.space_invaders:space_invaders_minimal",
         "probe/ConstantReward-v0": "thorndike.environments.probes:constant_reward",
         "probe/ConstantRewardContinuous-v0": "thorndike.environments.probes:constant_reward_continuous",
         "probe/ObservedReward-v0": "thorndike.environments.probes:observed_reward",
@@ -46,3 +58,11 @@ def factory(id: str) -> "Callable[..., Dynamics]":
         raise UserError(f"{id!r} has no native engine: expected one of {', '.join(NATIVE)}; other environments run on a host engine")
     module, name = NATIVE[id].split(":")
     return getattr(importlib.import_module(module), name)
+
+
+def settings_of(id: str) -> frozenset[str]:
+    """The settings that a native environment can have at most, read from the text of its file: importing that brings JAX."""
+    module, _ = NATIVE[id].split(":")
+    path = Path(__file__).parents[2].joinpath(*module.split(".")[1:]).with_suffix(".py")
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    return frozenset(each.arg for node in tree.body if isinstance(node, ast.FunctionDef) for each in node.args.kwonlyargs)

@@ -74,19 +74,19 @@ def vectorize(dynamics: Dynamics, num_envs: int, max_episode_steps: int | None =
         return dynamics.draw_step(key_step, shape), dynamics.draw_reset(key_reset, shape)
 
     def init(key: Key[Array, ""]) -> tuple[VectorState, Observation]:
-        inner = _fresh(dynamics, dynamics.draw_reset(key, (num_envs,)), num_envs)
+        inner, obs = _fresh(dynamics, dynamics.draw_reset(key, (num_envs,)), num_envs)
         clock = () if limit is None else jnp.zeros((num_envs,), jnp.int32)
-        return VectorState(inner, clock), dynamics.observe(inner)
+        return VectorState(inner, clock), obs
 
     def step(state: VectorState, action: Action, noise: Noise) -> tuple[VectorState, Step]:
         noise_step, noise_reset = noise
         after, reward, terminated = dynamics.step(state.inner, action, noise_step)
         clock, truncated = _tick(state.clock, limit, terminated)
         done = terminated | truncated
-        fresh = _fresh(dynamics, noise_reset, num_envs)
+        fresh, first_obs = _fresh(dynamics, noise_reset, num_envs)
         next_obs = dynamics.observe(after)
         result = Step(
-            obs=_where(done, dynamics.observe(fresh), next_obs),
+            obs=_where(done, first_obs, next_obs),
             next_obs=next_obs,
             reward=reward,
             cost=jnp.zeros_like(reward),
@@ -110,12 +110,14 @@ def _tick(
     return later, later >= limit
 
 
-def _fresh(dynamics: Dynamics, noise: Noise, num_envs: int) -> PyTree:
-    """Initial states ``[B, ...]``, also where there is only one and no noise to take the batch from."""
+def _fresh(dynamics: Dynamics, noise: Noise, num_envs: int) -> tuple[PyTree, Observation]:
+    """Initial states and observations ``[B, ...]``, also where there is only one and no noise to take the batch from."""
     state = dynamics.reset(noise)
+    # One start is observed once, not once an environment.
+    start = state, dynamics.observe(state)
     if jax.tree.leaves(noise):
-        return state
-    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (num_envs, *leaf.shape)), state)
+        return start
+    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (num_envs, *leaf.shape)), start)
 
 
 def _where(condition: Bool[Array, " batch"], chosen: PyTree, otherwise: PyTree) -> PyTree:
