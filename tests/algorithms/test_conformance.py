@@ -131,7 +131,11 @@ class Bound(NamedTuple):
     traces: list[str]
 
 
-@pytest.fixture(scope="module", params=RUN)
+SLOW = ("td3", "crossq", "dqn, lstm", "pqn")
+"""Cases whose machinery another one runs too."""
+
+
+@pytest.fixture(scope="module", params=[pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name in RUN])
 def bound(request, quick_compile) -> Bound:
     case = RUN[request.param]
     algorithm, source = case.make()

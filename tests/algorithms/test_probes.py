@@ -230,7 +230,7 @@ SLOW_CASES = {
     "dqn, c51": lambda: learn(DISCRETE, partial(dqn_for, 1200, distribution="c51", v_min=-12.0, v_max=12.0, atoms=25), 1200),
     "dqn, reset": lambda: learn(DISCRETE, partial(dqn_for, 2400, reset_every=801 * NUM_ENVS), 2400),
     "qr_dqn": lambda: learn(DISCRETE, partial(dqn_for, 1200, learner=qr_dqn, n_quantiles=8), 1200),
-    "iqn": lambda: learn(DISCRETE, partial(dqn_for, 2000, learner=iqn, n_quantiles=8, net_arch=(16, 16)), 2000),
+    "iqn": lambda: learn(DISCRETE, partial(dqn_for, 1600, learner=iqn, n_quantiles=8, net_arch=(32, 32)), 1600),
     "sarsa": lambda: learn(DISCRETE, partial(table_for, 100, "sarsa"), 100, wrappers.discretise(3)),
     "expected sarsa": lambda: learn(DISCRETE, partial(table_for, 100, "expected_sarsa"), 100, wrappers.discretise(3)),
     "double q": lambda: learn(DISCRETE, partial(table_for, 100, "double_q"), 100, wrappers.discretise(3)),

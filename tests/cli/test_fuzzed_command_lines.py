@@ -88,7 +88,7 @@ def test_two_thousand_mistakes_are_one_line_each_in_under_half_a_second(place):
         answered = in_a_process(mistake, place, source)
         if answered.cpu_s >= 0.5:
             # Once more: the machine may have been busy with other things.
-            answered = min(answered, *(in_a_process(mistake, place, source) for _ in range(2)), key=lambda each: each.cpu_s)
+            answered = min(answered, *(in_a_process(mistake, place, source) for _ in range(4)), key=lambda each: each.cpu_s)
         found = fault(mistake, answered)
         faults += [] if found is None else [(mistake.kind, str(mistake.words)[:200], found, answered.err[-300:])]
         times.append((answered.cpu_s, mistake.kind, str(mistake.words)[:200]))

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import imageio.v3 as imageio
 import pytest
 
+from thorndike.algorithms import ALGORITHMS
 from thorndike.cli.main import main
 
 TRAINED = {"run", "status", "steps", "seeds", "wall_s", "cpu_s", "compile_s", "steps_per_s", "steps_per_cpu_s"}
@@ -100,14 +101,7 @@ def test_bench_measures_and_leaves_nothing_behind(tmp_path, capsys, monkeypatch)
 def test_settings_algorithms_presets_environments_and_info_are_listed(capsys):
     settings = answer(["list", "settings", "ppo"], capsys)["settings"]
     assert {"setting": "gamma", "default": "0.99", "value": "between 0 and 1", "meaning": "discount"} in settings
-    assert {row["algorithm"] for row in answer(["list", "algorithms"], capsys)["algorithms"]} == {
-        "ppo",
-        "a2c",
-        "reinforce",
-        "dqn",
-        "q_learning",
-        "planning",
-    }
+    assert {row["algorithm"] for row in answer(["list", "algorithms"], capsys)["algorithms"]} == set(ALGORITHMS)
     assert "CartPole-v1" in answer(["list", "environments"], capsys)["native"]
     assert any(row["environment"] == "CartPole-v1" for row in answer(["list", "presets"], capsys)["presets"])
     assert answer(["info"], capsys)["packages"]["jax"]

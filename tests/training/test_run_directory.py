@@ -60,7 +60,7 @@ def test_the_facts_say_how_to_make_the_run_again():
     found = facts()
     assert {"thorndike", "jax", "jaxlib", "numpy", "gymnasium", "python"} <= set(found["versions"])
     assert {"platform", "git_commit", "created", "processors", "format"} <= set(found)
-    assert set(found["machine"]) == {"processor", "xla_flags", "self_test"}
+    assert set(found["machine"]) == {"processor", "features", "xla_flags", "self_test"}
 
 
 @pytest.mark.parametrize(

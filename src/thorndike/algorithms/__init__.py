@@ -32,11 +32,11 @@ ALGORITHMS: dict[str, Entry] = {
     "iqn": Entry("thorndike.algorithms.iqn", "DQN on returns at random quantile levels; Munchausen; Discrete actions", ("Discrete",)),
     "pqn": Entry("thorndike.algorithms.pqn", "Q-network without replay or target, many environments; Discrete actions", ("Discrete",)),
     "sac": Entry("thorndike.algorithms.sac", "Soft actor-critic: off-policy, maximum entropy, learnt temperature; Box actions", ("Box",)),
-    "td3": Entry("thorndike.algorithms.td3", "Twin delayed DDPG: off-policy, deterministic, two critics; Box actions"),
-    "ddpg": Entry("thorndike.algorithms.ddpg", "Deep deterministic policy gradient: off-policy, one critic; Box actions"),
-    "tqc": Entry("thorndike.algorithms.tqc", "Truncated quantile critics: SAC on quantiles of the return; Box actions"),
-    "crossq": Entry("thorndike.algorithms.crossq", "SAC without target networks, batch-renormalised, wide critics; Box actions"),
-    "redq": Entry("thorndike.algorithms.redq", "SAC with ten critics and twenty updates a step: fewest steps; Box actions"),
+    "td3": Entry("thorndike.algorithms.td3", "Twin delayed DDPG: off-policy, deterministic, two critics; Box actions", ("Box",)),
+    "ddpg": Entry("thorndike.algorithms.ddpg", "Deep deterministic policy gradient: off-policy, one critic; Box actions", ("Box",)),
+    "tqc": Entry("thorndike.algorithms.tqc", "Truncated quantile critics: SAC on quantiles of the return; Box actions", ("Box",)),
+    "crossq": Entry("thorndike.algorithms.crossq", "SAC without target networks, batch-renormalised, wide critics; Box actions", ("Box",)),
+    "redq": Entry("thorndike.algorithms.redq", "SAC with ten critics and twenty updates a step: fewest steps; Box actions", ("Box",)),
     "q_learning": Entry(
         "thorndike.algorithms.q_learning", "Q-learning from a table; SARSA, expected SARSA, double Q, Q(lambda)", ("Discrete",)
     ),
