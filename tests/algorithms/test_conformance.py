@@ -131,7 +131,7 @@ class Bound(NamedTuple):
     traces: list[str]
 
 
-SLOW = ("td3", "crossq", "dqn, lstm", "pqn")
+SLOW = ("td3", "crossq", "dqn, lstm", "a2c, gru", "pqn")
 """Cases whose machinery another one runs too."""
 
 

@@ -209,11 +209,11 @@ CASES = {
     "a2c": lambda: learn(DISCRETE, partial(a2c_for, 600), 600),
     "reinforce": lambda: learn(DISCRETE, partial(reinforce_for, 800), 800),
     "dqn": lambda: learn(DISCRETE, partial(dqn_for, 1200), 1200),
-    "pqn": lambda: learn(DISCRETE, partial(pqn_for, 400), 400),
     "q_learning": lambda: learn(DISCRETE, partial(table_for, 60, "q_learning"), 60, wrappers.discretise(3)),
     "sac": lambda: learn(BOX, partial(control_for, 700, sac), 700),
 }
 SLOW_CASES = {
+    "pqn": lambda: learn(DISCRETE, partial(pqn_for, 400), 400),
     "td3": lambda: learn(BOX, partial(control_for, 700, td3, action_noise=0.3), 700, noisy=True),
     "ddpg": lambda: learn(BOX, partial(control_for, 700, ddpg, action_noise=0.3), 700, noisy=True),
     "tqc": lambda: learn(BOX, partial(control_for, 1200, tqc), 1200),
