@@ -171,7 +171,7 @@ class StepsEnv(gymnasium.Env):
         self.observation_space, self.action_space = spaces.Discrete(50), spaces.Discrete(2)
 
     def reset(self, *, seed=None, options=None):
-        self.count = 0
+        self.count = self.faulty.count = 0
         return 0, {}
 
     def step(self, action):

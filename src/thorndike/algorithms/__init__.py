@@ -10,6 +10,12 @@ class Entry(NamedTuple):
     description: str
     actions: tuple[str, ...] = ()
     """The kinds of action space that it takes; empty for all of them."""
+    num_envs: int = 8
+    """Environments of each seed, where nobody says how many."""
+    tabular: bool = False
+    """Whether it learns in a table, without a network: masks and images are nothing to it."""
+    network: bool = True
+    """Whether a network of the user's own can take the place of its own."""
 
 
 ALGORITHMS: dict[str, Entry] = {
@@ -22,26 +28,57 @@ ALGORITHMS: dict[str, Entry] = {
         "thorndike.algorithms.dqn",
         "Deep Q-network: replay and target network; every part of the family to switch on; Discrete actions",
         ("Discrete",),
+        num_envs=4,
     ),
     "rainbow": Entry(
         "thorndike.algorithms.rainbow",
         "DQN with six improvements: double, dueling, n-step, prioritised, noisy, C51; Discrete actions",
         ("Discrete",),
+        num_envs=4,
     ),
-    "qr_dqn": Entry("thorndike.algorithms.qr_dqn", "DQN on quantiles of the return; Discrete actions", ("Discrete",)),
-    "iqn": Entry("thorndike.algorithms.iqn", "DQN on returns at random quantile levels; Munchausen; Discrete actions", ("Discrete",)),
-    "pqn": Entry("thorndike.algorithms.pqn", "Q-network without replay or target, many environments; Discrete actions", ("Discrete",)),
-    "sac": Entry("thorndike.algorithms.sac", "Soft actor-critic: off-policy, maximum entropy, learnt temperature; Box actions", ("Box",)),
-    "td3": Entry("thorndike.algorithms.td3", "Twin delayed DDPG: off-policy, deterministic, two critics; Box actions", ("Box",)),
-    "ddpg": Entry("thorndike.algorithms.ddpg", "Deep deterministic policy gradient: off-policy, one critic; Box actions", ("Box",)),
-    "tqc": Entry("thorndike.algorithms.tqc", "Truncated quantile critics: SAC on quantiles of the return; Box actions", ("Box",)),
-    "crossq": Entry("thorndike.algorithms.crossq", "SAC without target networks, batch-renormalised, wide critics; Box actions", ("Box",)),
-    "redq": Entry("thorndike.algorithms.redq", "SAC with ten critics and twenty updates a step: fewest steps; Box actions", ("Box",)),
+    "qr_dqn": Entry("thorndike.algorithms.qr_dqn", "DQN on quantiles of the return; Discrete actions", ("Discrete",), num_envs=4),
+    "iqn": Entry(
+        "thorndike.algorithms.iqn", "DQN on returns at random quantile levels; Munchausen; Discrete actions", ("Discrete",), num_envs=4
+    ),
+    "pqn": Entry(
+        "thorndike.algorithms.pqn", "Q-network without replay or target, many environments; Discrete actions", ("Discrete",), num_envs=16
+    ),
+    "sac": Entry(
+        "thorndike.algorithms.sac", "Soft actor-critic: off-policy, maximum entropy, learnt temperature; Box actions", ("Box",), num_envs=1
+    ),
+    "td3": Entry(
+        "thorndike.algorithms.td3", "Twin delayed DDPG: off-policy, deterministic, two critics; Box actions", ("Box",), num_envs=1
+    ),
+    "ddpg": Entry(
+        "thorndike.algorithms.ddpg", "Deep deterministic policy gradient: off-policy, one critic; Box actions", ("Box",), num_envs=1
+    ),
+    "tqc": Entry(
+        "thorndike.algorithms.tqc", "Truncated quantile critics: SAC on quantiles of the return; Box actions", ("Box",), num_envs=1
+    ),
+    "crossq": Entry(
+        "thorndike.algorithms.crossq",
+        "SAC without target networks, batch-renormalised, wide critics; Box actions",
+        ("Box",),
+        num_envs=1,
+        network=False,
+    ),
+    "redq": Entry(
+        "thorndike.algorithms.redq", "SAC with ten critics and twenty updates a step: fewest steps; Box actions", ("Box",), num_envs=1
+    ),
     "q_learning": Entry(
-        "thorndike.algorithms.q_learning", "Q-learning from a table; SARSA, expected SARSA, double Q, Q(lambda)", ("Discrete",)
+        "thorndike.algorithms.q_learning",
+        "Q-learning from a table; SARSA, expected SARSA, double Q, Q(lambda)",
+        ("Discrete",),
+        num_envs=1,
+        tabular=True,
+        network=False,
     ),
     "planning": Entry(
-        "thorndike.algorithms.planning", "Value iteration, policy iteration, evaluation, finite horizon on a known model", ("Discrete",)
+        "thorndike.algorithms.planning",
+        "Value iteration, policy iteration, evaluation, finite horizon on a known model",
+        ("Discrete",),
+        tabular=True,
+        network=False,
     ),
 }
 """Name on the command line -> entry. A new algorithm is one more line here."""

@@ -29,25 +29,8 @@ if TYPE_CHECKING:
 EnvironmentLike: TypeAlias = str | gymnasium.Env | Callable[..., gymnasium.Env] | gymnasium.vector.VectorEnv | Environment | Dynamics
 
 DEFAULT_STEPS = 100_000
-DEFAULT_NUM_ENVS = {
-    "ppo": 8,
-    "a2c": 8,
-    "reinforce": 8,
-    "dqn": 4,
-    "rainbow": 4,
-    "qr_dqn": 4,
-    "iqn": 4,
-    "pqn": 16,
-    "q_learning": 1,
-    "sac": 1,
-    "td3": 1,
-    "ddpg": 1,
-    "tqc": 1,
-    "redq": 1,
-}
 LOG_POINTS = 100
 CHECKPOINTS = 10
-_WITH_NETWORK = ("ppo", "a2c", "reinforce", "dqn", "rainbow", "qr_dqn", "iqn", "pqn", "sac", "td3", "ddpg", "tqc", "redq")
 
 
 class Request(NamedTuple):
@@ -145,8 +128,9 @@ def build_from_config(name: str, settings: "DataclassInstance", spec: EnvSpec, n
     factory = getattr(importlib.import_module(ALGORITHMS[name].module), name)
     if network is None:
         return factory(settings, spec)
-    if name not in _WITH_NETWORK:
-        raise UserError(f"{name} has no network to replace; {', '.join(_WITH_NETWORK)} do")
+    if not ALGORITHMS[name].network:
+        replaceable = [other for other, entry in ALGORITHMS.items() if entry.network]
+        raise UserError(f"{name} has no network to replace; {', '.join(replaceable)} do")
     return factory(settings, spec, network)
 
 
@@ -176,7 +160,7 @@ def full_request(
         steps=steps,
         seeds=seeds,
         seed=seed,
-        num_envs=num_envs or preset.num_envs or DEFAULT_NUM_ENVS[algorithm],
+        num_envs=num_envs or preset.num_envs or ALGORITHMS[algorithm].num_envs,
         log_every=math.ceil(steps / LOG_POINTS),
         checkpoint_every=checkpoint_every or math.ceil(steps / CHECKPOINTS),
     )
@@ -201,7 +185,7 @@ def build_job(
         spec, close = environment.spec, _nothing
     else:
         engine = registry.build_host(
-            choice, request.num_envs * len(indices), masks=request.algorithm in _WITH_NETWORK, env_timeout=env_timeout
+            choice, request.num_envs * len(indices), masks=not ALGORITHMS[request.algorithm].tabular, env_timeout=env_timeout
         )
         spec, close = engine.spec._replace(num_envs=request.num_envs), engine.close
         algorithm, plan = _learner(request, spec, wrapper, build)
@@ -212,7 +196,7 @@ def build_job(
 
 def is_large(request_algorithm: str, choice: registry.Choice) -> bool:
     """Whether the run is large enough for an accelerator: images, that is convolutions."""
-    if request_algorithm not in _WITH_NETWORK or choice.engine == "native":
+    if ALGORITHMS[request_algorithm].tabular or choice.engine == "native":
         return False
     probe = registry.reference(choice)
     image = is_image(probe.observation_space)

@@ -12,6 +12,7 @@ from typing import NamedTuple, cast
 import numpy as np
 
 from thorndike import startup
+from thorndike.algorithms import ALGORITHMS
 from thorndike.api.building import Request, check_algorithm, full_config, full_request, is_large
 from thorndike.api.loading import load
 from thorndike.api.recorded_run import refuse_code
@@ -277,7 +278,7 @@ def _learner_spec(request: Request, choice: registry.Choice) -> EnvSpec:
     wrapper = wrappers.from_settings(request.wrappers)
     if choice.engine == "native":
         return wrapper.spec(registry.build_native(choice, request.num_envs).spec)
-    with closing(registry.build_host(choice, 1, masks=request.algorithm != "q_learning")) as engine:
+    with closing(registry.build_host(choice, 1, masks=not ALGORITHMS[request.algorithm].tabular)) as engine:
         return wrapper.spec(engine.spec._replace(num_envs=request.num_envs))
 
 
