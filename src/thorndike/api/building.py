@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import gymnasium
 
+from thorndike import startup
 from thorndike.algorithms import ALGORITHMS
 from thorndike.environments import registry, wrappers
 from thorndike.environments.native.vectorize import Dynamics
@@ -16,6 +17,7 @@ from thorndike.errors import UserError
 from thorndike.networks.network import NetworkBuilder
 from thorndike.networks.torso import is_image
 from thorndike.suggestions import did_you_mean
+from thorndike.training.devices import devices_for
 from thorndike.training.host_source import HostEngine, HostSource, host_source
 from thorndike.training.presets import Preset
 from thorndike.training.runner import Runner, page_length, runner
@@ -173,8 +175,12 @@ def build_job(
     network: NetworkBuilder | None,
     env_timeout: float | None = None,
     lanes: Lanes | None = None,
+    devices: int = 1,
 ) -> Job:
-    """Bind a request to its environment, learner, source and runner; ``lanes`` are other agents than its seeds, with their own learner."""
+    """Bind a request to its environment, learner, source and runner; ``lanes`` are other agents than its seeds, with their own learner.
+
+    On compiled environments at most ``devices`` share the agents.
+    """
     wrapper = wrappers.from_settings(request.wrappers) if given is None else wrappers.chain(*given)
     indices = range(request.seeds) if lanes is None else lanes.agents
     build = partial(build_algorithm, request.algorithm, request.config, network=network) if lanes is None else lanes.build
@@ -190,8 +196,14 @@ def build_job(
         spec, close = engine.spec._replace(num_envs=request.num_envs), engine.close
         algorithm, plan = _learner(request, spec, wrapper, build)
         source = host_source(engine, algorithm, wrapper, request.seed, indices, plan.checkpoint_every)
-    bound = runner(algorithm, source, request.seed, indices)
+    bound = runner(algorithm, source, request.seed, indices, devices_for(len(indices), devices))
     return Job(request, algorithm, wrapper, spec, source, bound, plan, close)
+
+
+def prepare_devices(choice: registry.Choice, seeds: int, at_most: int | None = None) -> None:
+    """Before JAX chooses its devices: as many cores as can share the seeds count as devices, where the environment is compiled."""
+    if choice.engine == "native":
+        startup.count_cores_as_devices(devices_for(seeds, min(startup.cores(), at_most or seeds)))
 
 
 def is_large(request_algorithm: str, choice: registry.Choice) -> bool:
