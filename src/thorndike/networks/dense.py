@@ -5,8 +5,8 @@ import jax
 from jax.lax import optimization_barrier
 from jaxtyping import Array, Float
 
-_SMALL = 128
-"""Widths up to which the gradient's own form wins; above it the copies cost what they save (measured with 256)."""
+_NARROW = 128
+"""Widths up to which the gradient's own form wins; where both are above, the copies cost what they save (measured with 256 x 256)."""
 
 
 @jax.custom_vjp
@@ -32,10 +32,11 @@ def _backward(held: tuple[Array, Array], gradient: Float[Array, "*B O"]) -> tupl
 
 
 def _kernel_gradient(rows: Float[Array, "N I"], columns: Float[Array, "N O"]) -> Float[Array, "I O"]:
-    outputs = columns.shape[1]
+    """The sum of outer products; the narrower of the two matrices is the one that is copied to its transpose."""
+    inputs, outputs = rows.shape[1], columns.shape[1]
     if outputs == 1:
         return (columns.T @ rows).T
-    if outputs < 16:
+    if outputs < inputs:
         return optimization_barrier(optimization_barrier(columns.T) @ rows).T
     return optimization_barrier(rows.T) @ columns
 
@@ -45,8 +46,8 @@ product.defvjp(_forward, _backward)
 
 def _dot_general(x: Array, kernel: Array, dimension_numbers: object, precision: object = None) -> Array:
     """What ``nn.Dense`` asks for: the last axis of the input with the first of the kernel."""
-    small = max(kernel.shape) <= _SMALL and jax.default_backend() == "cpu"
-    return product(x, kernel) if small else x @ kernel
+    narrow = min(kernel.shape) <= _NARROW and jax.default_backend() == "cpu"
+    return product(x, kernel) if narrow else x @ kernel
 
 
 def dense(features: int, kernel_init: nn.initializers.Initializer, name: str | None = None) -> nn.Dense:
