@@ -40,6 +40,11 @@ class Waiting(gymnasium.Wrapper):
         return outcome
 
 
+def waiting_cartpole(wait: float) -> gymnasium.Env:
+    """One of them."""
+    return Waiting(wait)
+
+
 def stepping() -> tuple[float, float]:
     """Seconds from the first step to the end of the last, and those in which at least one environment was in its step."""
     spans = sorted(Waiting.spans)
@@ -55,7 +60,7 @@ def measure(wait: float, steps: int, threads: int) -> tuple[float, float]:
     Waiting.spans.clear()
     with tempfile.TemporaryDirectory() as folder:
         td.train(
-            "impala", Waiting, env_kwargs={"wait": wait}, engine="gymnasium", num_envs=1, steps=steps, checkpoint_every=steps,
+            "impala", waiting_cartpole, env_kwargs={"wait": wait}, engine="gymnasium", num_envs=1, steps=steps, checkpoint_every=steps,
             settings=SETTINGS, output=folder, actor_threads=threads, progress=False,
         )  # fmt: skip
     # The first tenth compiles.
