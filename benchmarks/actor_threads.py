@@ -1,10 +1,10 @@
 """Acting and learning side by side: IMPALA with and without actor threads, on an environment that waits a millisecond a step.
 
-python benchmarks/actor_threads.py [--wait 0.001] [--steps 8000]
+python benchmarks/actor_threads.py [--wait 0.001] [--steps 4000] [--rounds 3]
 
-A row is a run in this process, after one that compiled the same programs. `stepping` is the share of the wall time in which at least one
-environment is in its step: what is missing to 100 % is time in which all of them stand still, because an actor decides or the learner
-learns. A fixed schedule, 20 steps an update, one environment a thread, two hidden layers of 256.
+A row is the fastest of the rounds, in which the runs take turns in this process. `stepping` is the share of the wall time in which at
+least one environment is in its step: what is missing to 100 % is time in which all of them stand still, because an actor decides or the
+learner learns. A fixed schedule, 20 steps an update, one environment a thread, two hidden layers of 256.
 """
 
 import argparse
@@ -17,6 +17,7 @@ import numpy as np
 
 import thorndike as td
 
+THREADS = (0, 1, 2, 4)
 SETTINGS = {"policy_lag": 0, "n_steps": 20, "net_arch": (256, 256)}
 
 
@@ -72,13 +73,17 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--wait", type=float, default=0.001, help="seconds that a step waits")
-    parser.add_argument("--steps", type=int, default=8_000)
+    parser.add_argument("--steps", type=int, default=4_000)
+    parser.add_argument("--rounds", type=int, default=3)
     options = parser.parse_args()
+    best: dict[int, tuple[float, float]] = {}
+    for _ in range(options.rounds):
+        for threads in THREADS:
+            best[threads] = min(best.get(threads, (np.inf, 0.0)), measure(options.wait, options.steps, threads))
     print("| actor threads | wall, s | steps/s | stepping |")
     print("|---|---|---|---|")
-    for threads in (0, 1, 2, 4):
-        wall, covered = measure(options.wait, options.steps, threads)
-        print(f"| {threads} | {wall:.2f} | {0.9 * options.steps / wall:,.0f} | {100 * covered / wall:.0f} % |", flush=True)
+    for threads, (wall, covered) in best.items():
+        print(f"| {threads} | {wall:.2f} | {0.9 * options.steps / wall:,.0f} | {100 * covered / wall:.0f} % |")
 
 
 if __name__ == "__main__":

@@ -24,6 +24,7 @@ from thorndike.environments.host.gymnasium_engine import LoopEngine
 from thorndike.errors import UserError
 from thorndike.training import actor_threads
 from thorndike.training.actor_threads import ActorThreads, ThreadedSource, threaded_source
+from thorndike.training.runner import runner
 
 LENGTH, SEGMENT, SEED = 4, 6, 3
 CONFIG = impala.Config(n_steps=LENGTH, net_arch=(4,), policy_lag=0)
@@ -135,21 +136,31 @@ def check_rows(rollout) -> None:
 
 def play_through(faults: int, schedule: str, threads: int = 3, num_envs: int = 1) -> tuple[int, int]:
     """Segments until so many faults: every step that was given was learnt from once. How many faults and steps there were."""
-    play = start(threads, ActorThreads(threads, schedule, 10_000), chance=0.05, wait=0.0005, num_envs=num_envs)
+    build = partial(LoopEngine, [partial(NumberedEnv, 0.05, 0.0005)] * num_envs, "numbered")
+    engines = [build() for _ in range(threads)]
+    algorithm = impala.impala(CONFIG, engines[0].spec)
+    asked = ActorThreads(threads, schedule, 10_000)
+    source, close = threaded_source(engines, build, algorithm, wrappers.chain(), SEED, [0], SEGMENT, asked)
     rollouts: list = []
 
+    def collect(state, actor, noise):
+        state, rollout, episodes = source.source.collect(state, actor, noise)
+        rollouts.append(rollout)
+        return state, rollout, episodes
+
     def work() -> None:
-        state = play.source.source.source.init(jax.random.split(jax.random.key(0), 1))
-        iteration = 0
-        while len(NumberedEnv.faults) < faults or iteration % SEGMENT:
-            state, rollout, _ = play.act(state, play.actor, iteration)
-            rollouts.append(rollout)
-            iteration += 1
+        bound = runner(algorithm, source._replace(source=source.source._replace(collect=collect)), SEED, [0])
+        carry, iteration = bound.init(), 0
+        while len(NumberedEnv.faults) < faults:
+            carry, report = bound.advance(carry, iteration, SEGMENT)
+            iteration += SEGMENT
+            assert all(np.isfinite(values).all() for values in report.metrics.values())
+            assert report.episodes.steps[0] == SEGMENT * LENGTH * num_envs
 
     try:
         within(300, work)
     finally:
-        play.source.close()
+        close()
     for rollout in rollouts:
         check_rows(rollout)
     numbers = learnt(rollouts)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias, cast
 
 import gymnasium
 
@@ -284,8 +284,9 @@ def _learner(request: Request, spec: EnvSpec, wrapper: Wrapper, build: Callable[
 def actor_threads(request: Request) -> ActorThreads:
     """The actor threads of a request. Raises ``UserError`` where ``run.json`` was changed to what cannot be."""
     fields: dict[str, Kind] = {"threads": whole(1, _MOST_THREADS), "schedule": TEXT, "restarts": whole(0)}
-    check_fields(request.actors or {}, fields, Path("run.json"))
-    return ActorThreads(**request.actors)  # type: ignore[arg-type]
+    actors = request.actors or {}
+    check_fields(actors, fields, Path("run.json"))
+    return ActorThreads(cast(int, actors["threads"]), cast(str, actors["schedule"]), cast(int, actors["restarts"]))
 
 
 def _nothing() -> None:
