@@ -38,6 +38,9 @@ BARS = (
     Bar("ppo", "Pendulum-v1", "mean", -185),
     Bar("ppo", "LunarLander-v3", "mean", 235),
     Bar("a2c", "CartPole-v1", "iqm", 490),
+    Bar("a3c", "CartPole-v1", "iqm", 490),
+    Bar("impala", "CartPole-v1", "iqm", 490),
+    Bar("trpo", "CartPole-v1", "iqm", 490),
     Bar("reinforce", "CartPole-v1", "iqm", 475),
     Bar("dqn", "CartPole-v1", "iqm", 490),
     Bar("dqn", "Acrobot-v1", "mean", -82),
@@ -114,7 +117,8 @@ def write(content: dict) -> Path:
 def tables() -> None:
     """Write the tables of the README and of the algorithms' pages from the JSON files."""
     results = [json.loads(path.read_text()) for path in sorted(RESULTS.glob("*.json"))]
-    for algorithm in ("ppo", "dqn", "rainbow", "qr_dqn", "pqn", "a2c", "reinforce", "sac", "td3", "ddpg", "tqc", "crossq", "redq"):
+    pages = ("ppo", "trpo", "a2c", "a3c", "impala", "reinforce", "dqn", "rainbow", "qr_dqn", "pqn")
+    for algorithm in (*pages, "sac", "td3", "ddpg", "tqc", "crossq", "redq"):
         own = [result for result in results if result["bar"]["algorithm"] == algorithm]
         head = ["environment", "steps", "mean", "IQM", "worst seed", "95 % interval of the mean", "bar", "CPU-s, 10 seeds", "command"]
         _replace(ROOT / "docs" / "algorithms" / f"{algorithm}.md", [head, *(_row(result) for result in own)])

@@ -64,6 +64,8 @@ def read_record(run: Path) -> Json:
     if record["algorithm"] == "planning":
         raise UserError(f"{run} is a plan: it is complete, there is nothing to go on with; `thorndike train planning` plans again")
     check_fields(record, _OF_RUN, where)
+    # Runs of older versions do not have it.
+    check_fields({"actors": record.get("actors")}, {"actors": optional(OBJECT)}, where)
     _check_learner(record, where)
     return record
 

@@ -9,7 +9,26 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from thorndike.algorithms import a2c, crossq, ddpg, dqn, iqn, ppo, pqn, q_learning, qr_dqn, rainbow, redq, reinforce, sac, td3, tqc
+from thorndike.algorithms import (
+    a2c,
+    a3c,
+    crossq,
+    ddpg,
+    dqn,
+    impala,
+    iqn,
+    ppo,
+    pqn,
+    q_learning,
+    qr_dqn,
+    rainbow,
+    redq,
+    reinforce,
+    sac,
+    td3,
+    tqc,
+    trpo,
+)
 from thorndike.environments import wrappers
 from thorndike.environments.native import factory
 from thorndike.environments.native.vectorize import vectorize
@@ -57,6 +76,7 @@ def parts(config, **changes):
     return dataclasses.replace(config, **changes)
 
 
+TRPO = trpo.Config(total_steps=1000, n_steps=8, batch_size=16, n_critic_updates=2, net_arch=(8,), cg_max_steps=4)
 BINS = (wrappers.discretise(6),)
 RUN = {
     "sac": Case(sac.sac, sac.Config(**CONTROL, gradient_steps=3, n_critics=3, policy_delay=2, noise_color=1.0), "Pendulum-v1"),
@@ -64,6 +84,9 @@ RUN = {
     "crossq": Case(crossq.crossq, crossq.Config(**CONTROL, critic_net_arch=(8,), renorm_warmup=2), "Pendulum-v1"),
     "dqn, lstm": Case(dqn.dqn, parts(DQN, memory="lstm", memory_size=8, sequence_length=4, double=True), "CartPole-v1"),
     "a2c, gru": Case(a2c.a2c, a2c.Config(net_arch=(8,), memory="gru", memory_size=8), "CartPole-v1"),
+    "impala": Case(impala.impala, impala.Config(total_steps=1000, n_steps=5, net_arch=(8,), policy_lag=2), "CartPole-v1", NORMALISED),
+    "trpo": Case(trpo.trpo, TRPO, "CartPole-v1"),
+    "a3c, gru": Case(a3c.a3c, a3c.Config(net_arch=(8,), memory="gru", memory_size=8), "CartPole-v1"),
     "ppo": Case(ppo.ppo, PPO, "CartPole-v1", NORMALISED),
     "dqn": Case(dqn.dqn, parts(DQN, double=True, dueling=True, n_step=3), "CartPole-v1"),
     "rainbow": Case(rainbow.rainbow, rainbow.Config(**OF_THE_FAMILY, atoms=11), "CartPole-v1"),
@@ -83,6 +106,12 @@ ALL = RUN | {
     "ppo, gru": Case(ppo.ppo, parts(PPO, memory="gru", memory_size=8), "CartPole-v1", NORMALISED),
     "a2c, lstm": Case(a2c.a2c, a2c.Config(net_arch=(8,), memory="lstm", memory_size=8), "CartPole-v1"),
     "a2c, Box": Case(a2c.a2c, a2c.Config(net_arch=(8,)), "Pendulum-v1"),
+    "a3c": Case(a3c.a3c, a3c.Config(net_arch=(8,), policy_lag=1, thread_lag=2), "CartPole-v1"),
+    "a3c, Box": Case(a3c.a3c, a3c.Config(net_arch=(8,), normalize_advantage=True), "Pendulum-v1"),
+    "impala, lstm": Case(impala.impala, impala.Config(net_arch=(8,), n_steps=5, memory="lstm", memory_size=8), "CartPole-v1"),
+    "impala, Box": Case(impala.impala, impala.Config(net_arch=(8,), n_steps=5, policy_lag=0), "Pendulum-v1"),
+    "trpo, Box": Case(trpo.trpo, TRPO, "Pendulum-v1", NORMALISED),
+    "trpo, gru": Case(trpo.trpo, parts(TRPO, memory="gru", memory_size=8), "CartPole-v1"),
     "reinforce": Case(reinforce.reinforce, reinforce.Config(n_steps=8, net_arch=(8,)), "CartPole-v1"),
     "reinforce, lstm": Case(reinforce.reinforce, reinforce.Config(n_steps=8, net_arch=(8,), memory="lstm", memory_size=8), "CartPole-v1"),
     "dqn, gru": Case(dqn.dqn, parts(DQN, memory="gru", memory_size=8, sequence_length=4), "CartPole-v1"),
@@ -149,7 +178,7 @@ class Bound(NamedTuple):
     traces: list[str]
 
 
-SLOW = ("td3", "crossq", "dqn, lstm", "a2c, gru", "pqn")
+SLOW = ("td3", "crossq", "dqn, lstm", "a2c, gru", "a3c, gru", "trpo", "pqn")
 """Cases whose machinery another one runs too."""
 
 
@@ -242,7 +271,10 @@ def test_a_seed_among_others_is_that_seed_alone(bound):
     assert_equal(jax.tree.map(lambda leaf: leaf[1:2], (many, reports[0])), (one, report))
 
 
-@pytest.mark.parametrize("name", ["reinforce", "reinforce, lstm", "ppo, gru", "a2c, Box"])
+@pytest.mark.parametrize(
+    "name",
+    ["reinforce", "reinforce, lstm", "ppo, gru", "a2c, Box", *(pytest.param(name, marks=pytest.mark.slow) for name in ("trpo", "a3c"))],
+)
 def test_a_seed_among_others_is_that_seed_alone_in_learners_that_are_not_tried_as_a_whole(name, quick_compile):
     many, alone = (runner(*ALL[name].make(), 3, indices) for indices in (range(2), [1]))
     (carry, report), (one, told) = (each.advance(each.init(), 0, 2) for each in (many, alone))

@@ -9,7 +9,7 @@ import pytest
 from gymnasium import spaces
 
 from algorithms.small_environments import forbidding
-from thorndike.algorithms import a2c, dqn, iqn, ppo, pqn, q_learning, rainbow, reinforce
+from thorndike.algorithms import a2c, a3c, dqn, impala, iqn, ppo, pqn, q_learning, rainbow, reinforce, trpo
 from thorndike.environments import wrappers
 from thorndike.environments.host.action_masks import mask_in_observation
 from thorndike.environments.native.vectorize import vectorize
@@ -52,6 +52,9 @@ def test_masked_ppo_never_picks_a_forbidden_action(memory, at_least):
     [
         (ppo.ppo, ppo.Config(n_steps=16, batch_size=256, learning_rate=3e-3, net_arch=(32,)), 60, 2),
         pytest.param(a2c.a2c, a2c.Config(learning_rate=3e-3, net_arch=(32,)), 600, 1, marks=pytest.mark.slow),
+        pytest.param(a3c.a3c, a3c.Config(learning_rate=3e-3, net_arch=(32,)), 600, 1, marks=pytest.mark.slow),
+        pytest.param(impala.impala, impala.Config(learning_rate=3e-3, n_steps=5, net_arch=(32,)), 600, 1, marks=pytest.mark.slow),
+        pytest.param(trpo.trpo, trpo.Config(n_steps=16, batch_size=256, learning_rate=3e-3, net_arch=(32,)), 60, 2, marks=pytest.mark.slow),
         pytest.param(reinforce.reinforce, reinforce.Config(n_steps=16, learning_rate=1e-2, net_arch=(32,)), 300, 1, marks=pytest.mark.slow),
         (dqn.dqn, dqn.Config(learning_rate=2e-3, learning_starts=512, train_freq=64, gradient_steps=4, gamma=0.5, exploration_final_eps=0.2,
                              target_update_interval=640, double=True, n_step=2, net_arch=(32,), total_steps=60_000), 900, 1),
@@ -62,7 +65,7 @@ def test_masked_ppo_never_picks_a_forbidden_action(memory, at_least):
                      target_update_interval=640, net_arch=(32, 32), exploration_final_eps=0.2, munchausen=True, total_steps=60_000),
                      900, 1, marks=pytest.mark.slow),
     ],
-    ids=["ppo, two components", "a2c", "reinforce", "dqn", "pqn", "rainbow", "munchausen iqn"],
+    ids=["ppo, two components", "a2c", "a3c", "impala", "trpo, two components", "reinforce", "dqn", "pqn", "rainbow", "munchausen iqn"],
 )  # fmt: skip
 def test_learners_choose_the_best_of_what_is_allowed(build, config, iterations, components, quick_compile):
     _, worst, late = train(build, config, iterations, components)

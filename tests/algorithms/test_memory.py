@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from algorithms.small_environments import recall
-from thorndike.algorithms import a2c, dqn, ppo, reinforce
+from thorndike.algorithms import a2c, a3c, dqn, impala, ppo, reinforce, trpo
 from thorndike.environments import wrappers
 from thorndike.environments.native.vectorize import vectorize
 from thorndike.errors import UserError
@@ -21,6 +21,9 @@ from thorndike.training.sources import compiled_source
 NUM_ENVS, SEEDS = 16, 3
 PPO = ppo.Config(total_steps=1, n_steps=16, batch_size=128, n_epochs=4, learning_rate=3e-3, net_arch=(16,), memory="gru", memory_size=16)
 A2C = a2c.Config(total_steps=1, n_steps=8, learning_rate=3e-3, net_arch=(16,), memory="lstm", memory_size=16)
+A3C = a3c.Config(total_steps=1, n_steps=8, learning_rate=3e-3, net_arch=(16,), memory="lstm", memory_size=16)
+IMPALA = impala.Config(total_steps=1, n_steps=8, learning_rate=3e-3, net_arch=(16,), memory="gru", memory_size=16)
+TRPO = trpo.Config(total_steps=1, n_steps=16, batch_size=128, learning_rate=3e-3, net_arch=(16,), memory="gru", memory_size=16)
 REINFORCE = reinforce.Config(total_steps=1, n_steps=8, learning_rate=1e-2, net_arch=(16,), memory="gru", memory_size=16)
 DQN = dqn.Config(
     total_steps=1,
@@ -73,9 +76,12 @@ def greedy_return(build, config, iterations: int, rounds: int = 25) -> np.ndarra
         (ppo.ppo, PPO, 80),
         (dqn.dqn, DQN, 400),
         pytest.param(a2c.a2c, A2C, 500, marks=pytest.mark.slow),
+        pytest.param(a3c.a3c, A3C, 500, marks=pytest.mark.slow),
+        pytest.param(impala.impala, IMPALA, 500, marks=pytest.mark.slow),
+        pytest.param(trpo.trpo, TRPO, 80, marks=pytest.mark.slow),
         pytest.param(reinforce.reinforce, REINFORCE, 400, marks=pytest.mark.slow),
     ],
-    ids=["ppo gru", "dqn gru", "a2c lstm", "reinforce gru"],
+    ids=["ppo gru", "dqn gru", "a2c lstm", "a3c lstm", "impala gru", "trpo gru", "reinforce gru"],
 )
 def test_a_learner_with_memory_recalls_what_it_saw_at_the_beginning(build, config, iterations, quick_compile):
     assert (greedy_return(build, config, iterations) >= 0.95).all()

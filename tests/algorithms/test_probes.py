@@ -13,7 +13,26 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from thorndike.algorithms import a2c, crossq, ddpg, dqn, iqn, ppo, pqn, q_learning, qr_dqn, rainbow, redq, reinforce, sac, td3, tqc
+from thorndike.algorithms import (
+    a2c,
+    a3c,
+    crossq,
+    ddpg,
+    dqn,
+    impala,
+    iqn,
+    ppo,
+    pqn,
+    q_learning,
+    qr_dqn,
+    rainbow,
+    redq,
+    reinforce,
+    sac,
+    td3,
+    tqc,
+    trpo,
+)
 from thorndike.environments import wrappers
 from thorndike.environments.native import factory
 from thorndike.environments.native.randomness import draw_words
@@ -138,6 +157,21 @@ def a2c_for(iterations: int, spec: EnvSpec, **settings) -> Algorithm:
     return a2c.a2c(a2c.Config(total_steps=iterations * 10 * NUM_ENVS, **(config | settings)), spec)
 
 
+def a3c_for(iterations: int, spec: EnvSpec, **settings) -> Algorithm:
+    config = {"n_steps": 10, "gamma": GAMMA, "learning_rate": "linear(0.01, 0)", "ent_coef": 0.0, "net_arch": (16,)}
+    return a3c.a3c(a3c.Config(total_steps=iterations * 10 * NUM_ENVS, **(config | settings)), spec)
+
+
+def impala_for(iterations: int, spec: EnvSpec, **settings) -> Algorithm:
+    config = {"n_steps": 10, "gamma": GAMMA, "learning_rate": "linear(0.01, 0)", "ent_coef": 0.0, "net_arch": (16,)}
+    return impala.impala(impala.Config(total_steps=iterations * 10 * NUM_ENVS, **(config | settings)), spec)
+
+
+def trpo_for(iterations: int, spec: EnvSpec, **settings) -> Algorithm:
+    config = {"n_steps": 20, "batch_size": 80, "gamma": GAMMA, "learning_rate": "linear(0.01, 0)", "net_arch": (16,)}
+    return trpo.trpo(trpo.Config(total_steps=iterations * 20 * NUM_ENVS, **(config | settings)), spec)
+
+
 def reinforce_for(iterations: int, spec: EnvSpec, **settings) -> Algorithm:
     config = {"n_steps": 20, "gamma": GAMMA, "learning_rate": "linear(0.02, 0)", "net_arch": (16,), "max_grad_norm": 10.0}
     return reinforce.reinforce(reinforce.Config(total_steps=iterations * 20 * NUM_ENVS, **(config | settings)), spec)
@@ -207,6 +241,7 @@ CASES = {
     "ppo": lambda: learn(DISCRETE, partial(ppo_for, 60), 60),
     "ppo, Box": lambda: learn(BOX, partial(ppo_for, 60, log_std_init=-2.0), 60),
     "a2c": lambda: learn(DISCRETE, partial(a2c_for, 600), 600),
+    "impala": lambda: learn(DISCRETE, partial(impala_for, 600), 600),
     "reinforce": lambda: learn(DISCRETE, partial(reinforce_for, 800), 800),
     "dqn": lambda: learn(DISCRETE, partial(dqn_for, 1200), 1200),
     "q_learning": lambda: learn(DISCRETE, partial(table_for, 60, "q_learning"), 60, wrappers.discretise(3)),
@@ -222,6 +257,11 @@ SLOW_CASES = {
     ),
     "redq": lambda: learn(BOX, partial(control_for, 1200, redq, gradient_steps=4, policy_delay=2, n_critics=4), 1200),
     "a2c, Box": lambda: learn(BOX, partial(a2c_for, 600, log_std_init=-2.0), 600),
+    "a3c": lambda: learn(DISCRETE, partial(a3c_for, 600), 600),
+    "a3c, Box": lambda: learn(BOX, partial(a3c_for, 800, log_std_init=-2.0, learning_rate="linear(0.003, 0)"), 800),
+    "impala, Box": lambda: learn(BOX, partial(impala_for, 800, log_std_init=-2.0, learning_rate="linear(0.003, 0)"), 800),
+    "trpo": lambda: learn(DISCRETE, partial(trpo_for, 60, target_kl=0.05), 60),
+    "trpo, Box": lambda: learn(BOX, partial(trpo_for, 60, target_kl=0.05, log_std_init=-2.0), 60),
     "reinforce, Box": lambda: learn(BOX, partial(reinforce_for, 800, log_std_init=-2.0), 800),
     "dqn, double, dueling, 3 steps": lambda: learn(DISCRETE, partial(dqn_for, 1200, double=True, dueling=True, n_step=3), 1200),
     "rainbow": lambda: learn(DISCRETE, partial(dqn_for, 1200, learner=rainbow, v_min=-12.0, v_max=12.0, atoms=25), 1200),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from thorndike.algorithms import a2c, dqn, ppo, q_learning, reinforce
+from thorndike.algorithms import a2c, a3c, dqn, impala, ppo, q_learning, reinforce, trpo
 from thorndike.environments import wrappers
 from thorndike.environments.native.randomness import no_noise
 from thorndike.environments.native.vectorize import Dynamics, vectorize
@@ -39,6 +39,9 @@ def counting(bad: str, whole: bool = False) -> Dynamics:
 CASES = {
     "ppo": (ppo.ppo, ppo.Config(n_steps=8, batch_size=16, n_epochs=2, net_arch=(8,))),
     "a2c": (a2c.a2c, a2c.Config(net_arch=(8,))),
+    "a3c": (a3c.a3c, a3c.Config(net_arch=(8,))),
+    "impala": (impala.impala, impala.Config(n_steps=5, net_arch=(8,))),
+    "trpo": (trpo.trpo, trpo.Config(n_steps=8, batch_size=16, n_critic_updates=2, net_arch=(8,))),
     "reinforce": (reinforce.reinforce, reinforce.Config(n_steps=8, net_arch=(8,))),
     "dqn": (dqn.dqn, dqn.Config(learning_starts=8, train_freq=8, buffer_size=16, gradient_steps=4, batch_size=32, net_arch=(8,))),
     "q_learning": (q_learning.q_learning, q_learning.Config(total_steps=1000, n_steps=8)),
@@ -52,7 +55,11 @@ def bind(name: str, bad: str):
     return algorithm, runner(algorithm, compiled_source(environment, algorithm, wrappers.chain()), 0, range(2))
 
 
-@pytest.mark.parametrize("name", CASES)
+SLOW = ("a3c", "impala")
+"""Cases whose machinery another one runs too."""
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name in CASES])
 def test_an_update_from_a_reward_that_is_no_number_is_not_applied_and_is_reported(name, quick_compile):
     algorithm, bound = bind(name, "reward")
     iterations = 2 + BAD_STEP // algorithm.needs.rollout_length

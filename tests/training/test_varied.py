@@ -51,6 +51,8 @@ CASES = {
         3,
     ),
     "a2c": ("CartPole-v1", SMALL, {"learning_rate": "linear(1e-2,0)", "gae_lambda": 0.9, "rms_prop_eps": 1e-4}, 5),
+    "impala": ("CartPole-v1", {**SMALL, "n_steps": 5}, {"learning_rate": "linear(1e-2,0)", "clip_rho": 0.8, "trace_decay": 0.9}, 5),
+    "trpo": ("CartPole-v1", {**SMALL, "n_steps": 16, "batch_size": 16, "n_critic_updates": 2}, {"target_kl": 0.02, "gamma": 0.9}, 3),
     "reinforce": ("CartPole-v1", {**SMALL, "n_steps": 32}, {"learning_rate": 1e-2, "gamma": 0.9, "max_grad_norm": 0.1}, 3),
     "dqn": ("CartPole-v1", {**SMALL, "learning_starts": 16, "buffer_size": 128}, {"learning_rate": 1e-2, "gamma": 0.9, "tau": 0.5}, 30),
     "q_learning": ("FrozenLake-v1", {}, {"learning_rate": 0.5, "gamma": 0.9, "initial_value": 0.2, "exploration_final_eps": 0.2}, 50),
@@ -58,7 +60,7 @@ CASES = {
 
 
 @pytest.mark.usefixtures("quick_compile")
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow if name in ("impala", "trpo") else ()) for name in CASES])
 def test_a_lane_learns_what_an_agent_of_its_settings_learns(name):
     id, fixed, own, iterations = CASES[name]
     where, fixed = environment(id), {**fixed, "total_steps": 1_000}

@@ -24,6 +24,11 @@ ALGORITHMS: dict[str, Entry] = {
     "reinforce": Entry(
         "thorndike.algorithms.reinforce", "Policy gradient by whole returns, with or without a baseline; all kinds of actions"
     ),
+    "a3c": Entry(
+        "thorndike.algorithms.a3c", "Asynchronous advantage actor-critic: gradients of policies some updates old; all kinds of actions"
+    ),
+    "impala": Entry("thorndike.algorithms.impala", "Actor-critic that corrects for late actors by V-trace; all kinds of actions"),
+    "trpo": Entry("thorndike.algorithms.trpo", "Trust region policy optimisation: natural gradient, bounded KL; all kinds of actions"),
     "dqn": Entry(
         "thorndike.algorithms.dqn",
         "Deep Q-network: replay and target network; every part of the family to switch on; Discrete actions",

@@ -23,7 +23,7 @@ from jaxtyping import Array, Float, Int, Key, PyTree
 
 from thorndike.functional.action_distributions import ActionDistribution, action_distribution, saturation
 from thorndike.functional.guards import accept_if, all_finite
-from thorndike.functional.policy_losses import explained_variance, standardize, weighted_mean
+from thorndike.functional.policy_losses import actor_critic_loss, explained_variance, standardize
 from thorndike.functional.returns import generalized_advantage
 from thorndike.functional.schedules import schedule
 from thorndike.networks.heads import Shape, policy_network
@@ -79,17 +79,17 @@ def a2c_loss(
     )
     target = advantage + fixed_value
     scaled = standardize(advantage, weight) if config.normalize_advantage else advantage
-    policy = -weighted_mean(distribution.log_prob(parameters, rollout.action) * scaled, weight)
-    critic = weighted_mean(jnp.square(value - target), weight)
-    entropy = weighted_mean(distribution.entropy(parameters), weight)
-    loss = policy + config.vf_coef * critic - config.ent_coef * entropy
-    metrics = {
-        "train/loss": loss,
-        "train/policy_loss": policy,
-        "train/value_loss": critic,
-        "train/entropy_loss": -entropy,
-        "train/explained_variance": explained_variance(fixed_value, target, step.valid),
-    }
+    loss, metrics = actor_critic_loss(
+        distribution.log_prob(parameters, rollout.action),
+        distribution.entropy(parameters),
+        value,
+        scaled,
+        target,
+        weight,
+        config.vf_coef,
+        config.ent_coef,
+    )
+    metrics["train/explained_variance"] = explained_variance(fixed_value, target, step.valid)
     return loss, metrics
 
 

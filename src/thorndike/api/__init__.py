@@ -2,7 +2,27 @@
 
 from thorndike.api.building import make
 from thorndike.api.comparing import Comparison, compare
-from thorndike.api.learners import A2C, DDPG, DQN, IQN, PPO, PQN, QRDQN, REDQ, REINFORCE, SAC, TD3, TQC, CrossQ, Learner, QLearning, Rainbow
+from thorndike.api.learners import (
+    A2C,
+    A3C,
+    DDPG,
+    DQN,
+    IMPALA,
+    IQN,
+    PPO,
+    PQN,
+    QRDQN,
+    REDQ,
+    REINFORCE,
+    SAC,
+    TD3,
+    TQC,
+    TRPO,
+    CrossQ,
+    Learner,
+    QLearning,
+    Rainbow,
+)
 from thorndike.api.loading import LoadedPolicy, load
 from thorndike.api.loading import evaluate_run as evaluate
 from thorndike.api.reproducing import Reproduction, reproduce
@@ -12,8 +32,10 @@ from thorndike.api.training_result import Result
 
 __all__ = [
     "A2C",
+    "A3C",
     "DDPG",
     "DQN",
+    "IMPALA",
     "IQN",
     "PPO",
     "PQN",
@@ -23,6 +45,7 @@ __all__ = [
     "SAC",
     "TD3",
     "TQC",
+    "TRPO",
     "Comparison",
     "CrossQ",
     "Learner",

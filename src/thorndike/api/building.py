@@ -5,7 +5,8 @@ import importlib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias, cast
 
 import gymnasium
 
@@ -17,8 +18,10 @@ from thorndike.errors import UserError
 from thorndike.networks.network import NetworkBuilder
 from thorndike.networks.torso import is_image
 from thorndike.suggestions import did_you_mean
+from thorndike.training.actor_threads import SCHEDULES, ActorThreads, threaded_source
 from thorndike.training.devices import devices_for
 from thorndike.training.host_source import HostEngine, HostSource, host_source
+from thorndike.training.json_files import TEXT, Kind, check_fields, whole
 from thorndike.training.presets import Preset
 from thorndike.training.runner import Runner, page_length, runner
 from thorndike.training.session import Plan
@@ -30,6 +33,8 @@ if TYPE_CHECKING:
 
 EnvironmentLike: TypeAlias = str | gymnasium.Env | Callable[..., gymnasium.Env] | gymnasium.vector.VectorEnv | Environment | Dynamics
 
+NO_THREADS = ActorThreads()
+_MOST_THREADS = 1_000
 DEFAULT_STEPS = 100_000
 LOG_POINTS = 100
 CHECKPOINTS = 10
@@ -54,6 +59,8 @@ class Request(NamedTuple):
     num_envs: int
     log_every: int
     checkpoint_every: int
+    actors: dict[str, object] | None = None
+    """``ActorThreads`` that play while the learner learns, if there are any."""
 
 
 class Lanes(NamedTuple):
@@ -147,8 +154,10 @@ def full_request(
     seeds: int,
     seed: int,
     checkpoint_every: int | None,
+    actors: ActorThreads = NO_THREADS,
 ) -> Request:
     """What was asked for, and what the preset and the defaults add to it."""
+    check_actors(algorithm, choice, actors)
     steps = steps or preset.steps or DEFAULT_STEPS
     return Request(
         algorithm=algorithm,
@@ -165,7 +174,29 @@ def full_request(
         num_envs=num_envs or preset.num_envs or ALGORITHMS[algorithm].num_envs,
         log_every=math.ceil(steps / LOG_POINTS),
         checkpoint_every=checkpoint_every or math.ceil(steps / CHECKPOINTS),
+        actors=actors._asdict() if actors.threads else None,
     )
+
+
+def check_actors(algorithm: str, choice: registry.Choice, actors: ActorThreads) -> None:
+    """Raises ``UserError`` if there can be no such actor threads here."""
+    if actors.threads < 0 or actors.restarts < 0 or actors.schedule not in SCHEDULES:
+        raise UserError(
+            f"actor threads are 0 or more, on the schedule {' or '.join(SCHEDULES)}, with 0 or more restarts; got {actors.threads}, "
+            f"'{actors.schedule}', {actors.restarts}"
+        )
+    if not actors.threads:
+        if actors.restarts:
+            raise UserError("environments are made anew by actor threads only: give --actor-threads 1 (or more) beside --env-restarts")
+        return
+    if choice.engine == "native":
+        lag = " or set policy_lag, the same delay in a compiled loop," if "policy_lag" in full_config(algorithm, {}) else ""
+        raise UserError(
+            f"{choice.id} is compiled together with its learner, which needs no threads: leave --actor-threads out,{lag} "
+            "or give --engine gymnasium"
+        )
+    if isinstance(choice.origin, gymnasium.vector.VectorEnv):
+        raise UserError(f"{choice.id} is one vector, and each actor thread needs its own: give the id or class of its environment")
 
 
 def build_job(
@@ -190,12 +221,14 @@ def build_job(
         source: Source | HostSource = compiled_source(environment, algorithm, wrapper)
         spec, close = environment.spec, _nothing
     else:
-        engine = registry.build_host(
-            choice, request.num_envs * len(indices), masks=not ALGORITHMS[request.algorithm].tabular, env_timeout=env_timeout
+        engine = partial(
+            registry.build_host,
+            choice,
+            request.num_envs * len(indices),
+            masks=not ALGORITHMS[request.algorithm].tabular,
+            env_timeout=env_timeout,
         )
-        spec, close = engine.spec._replace(num_envs=request.num_envs), engine.close
-        algorithm, plan = _learner(request, spec, wrapper, build)
-        source = host_source(engine, algorithm, wrapper, request.seed, indices, plan.checkpoint_every)
+        spec, source, algorithm, plan, close = _on_host(request, engine, wrapper, build, indices)
     bound = runner(algorithm, source, request.seed, indices, devices_for(len(indices), devices))
     return Job(request, algorithm, wrapper, spec, source, bound, plan, close)
 
@@ -204,6 +237,32 @@ def prepare_devices(choice: registry.Choice, seeds: int, at_most: int | None = N
     """Before JAX chooses its devices: as many cores as can share the seeds count as devices, where the environment is compiled."""
     if choice.engine == "native":
         startup.count_cores_as_devices(devices_for(seeds, min(startup.cores(), at_most or seeds)))
+
+
+def _on_host(
+    request: Request, make: Callable[[], HostEngine], wrapper: Wrapper, build: Callable[[EnvSpec], Algorithm], indices: Sequence[int]
+) -> tuple[EnvSpec, HostSource, Algorithm, Plan, Callable[[], None]]:
+    """Spec, source, learner, plan and how to close the environments of a host engine. Raises ``UserError``."""
+    engines = [make()]
+    try:
+        spec = engines[0].spec._replace(num_envs=request.num_envs)
+        algorithm, plan = _learner(request, spec, wrapper, build)
+        if not request.actors:
+            source = host_source(engines[0], algorithm, wrapper, request.seed, indices, plan.checkpoint_every)
+            return spec, source, algorithm, plan, engines[0].close
+        actors = actor_threads(request)
+        if not algorithm.needs.on_policy:
+            raise UserError(
+                f"{request.algorithm} learns from a replay memory; actor threads feed learners such as impala, a3c, ppo and a2c"
+            )
+        while len(engines) < actors.threads:
+            engines.append(make())
+    except BaseException:
+        for engine in engines:
+            engine.close()
+        raise
+    threaded = threaded_source(engines, make, algorithm, wrapper, request.seed, indices, plan.checkpoint_every, actors)
+    return spec, threaded.source, algorithm, plan, threaded.close
 
 
 def is_large(request_algorithm: str, choice: registry.Choice) -> bool:
@@ -232,6 +291,14 @@ def _learner(request: Request, spec: EnvSpec, wrapper: Wrapper, build: Callable[
         # Host environments start afresh at checkpoints; a run ends at one, so that a longer run passes through the same states.
         plan = plan._replace(iterations=math.ceil(plan.iterations / plan.checkpoint_every) * plan.checkpoint_every)
     return algorithm, plan
+
+
+def actor_threads(request: Request) -> ActorThreads:
+    """The actor threads of a request. Raises ``UserError`` where ``run.json`` was changed to what cannot be."""
+    fields: dict[str, Kind] = {"threads": whole(1, _MOST_THREADS), "schedule": TEXT, "restarts": whole(0)}
+    actors = request.actors or {}
+    check_fields(actors, fields, Path("run.json"))
+    return ActorThreads(cast(int, actors["threads"]), cast(str, actors["schedule"]), cast(int, actors["restarts"]))
 
 
 def _nothing() -> None:

@@ -39,6 +39,9 @@ class Learner:
         wrappers: Sequence[Wrapper] | None = None,
         network: NetworkBuilder | None = None,
         env_kwargs: dict[str, object] | None = None,
+        actor_threads: int = 0,
+        actor_schedule: str = "fixed",
+        env_restarts: int = 0,
         **settings: object,
     ) -> None:
         """``settings`` are the fields of the algorithm's ``Config``. Raises ``UserError`` at once for one that it does not have."""
@@ -63,6 +66,9 @@ class Learner:
             wrappers=wrappers,
             network=network,
             env_kwargs=env_kwargs,
+            actor_threads=actor_threads,
+            actor_schedule=actor_schedule,
+            env_restarts=env_restarts,
         )
         self.result: Result | None = None
         self._policy: LoadedPolicy | None = None
@@ -113,6 +119,24 @@ class A2C(Learner):
     """Advantage actor-critic."""
 
     algorithm = "a2c"
+
+
+class A3C(Learner):
+    """Asynchronous advantage actor-critic."""
+
+    algorithm = "a3c"
+
+
+class IMPALA(Learner):
+    """Actor-critic with V-trace."""
+
+    algorithm = "impala"
+
+
+class TRPO(Learner):
+    """Trust region policy optimisation."""
+
+    algorithm = "trpo"
 
 
 class REINFORCE(Learner):

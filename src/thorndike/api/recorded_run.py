@@ -29,7 +29,7 @@ class Objects(NamedTuple):
 
 def request_in(record: Json, run: Path, objects: Objects) -> Request:
     """The request that a record holds. Raises ``UserError`` if it cannot be, or an object is needed again."""
-    request = Request(**{field: record[field] for field in Request._fields})  # type: ignore[arg-type]
+    request = Request(**{field: record[field] for field in Request._fields if field in record})  # type: ignore[arg-type]
     if record["network"] == "user" and objects.network is None:
         raise UserError(f"{run} was trained with a network of your own; go on in Python, with network=...")
     if record["environment_object"] and objects.environment is None:

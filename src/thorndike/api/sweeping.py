@@ -180,7 +180,7 @@ def resume_sweep(path: str | Path, *, progress: bool = False) -> Sweep:
     if found:
         notice(f"the last bits may differ from those that {path} had: {'; '.join(found)}")
     with blamed_on(path / FACTS):
-        request = Request(**{field: record[field] for field in Request._fields})  # type: ignore[arg-type]
+        request = Request(**{field: record[field] for field in Request._fields if field in record})  # type: ignore[arg-type]
         check_algorithm(request.algorithm)
         full_config(request.algorithm, {name: tuple(value) if isinstance(value, list) else value for name, value in request.config.items()})
         known = read_config_fields(request.algorithm)

@@ -16,6 +16,7 @@ from thorndike.environments import registry
 from thorndike.errors import UserError
 from thorndike.networks.network import NetworkBuilder
 from thorndike.records import read_record
+from thorndike.training.actor_threads import ActorThreads
 from thorndike.training.checkpoints import restore, save_checkpoint
 from thorndike.training.faults import locate
 from thorndike.training.json_files import Json
@@ -51,6 +52,9 @@ def train(
     network: NetworkBuilder | None = None,
     env_kwargs: Mapping[str, object] | None = None,
     env_timeout: float | None = None,
+    actor_threads: int = 0,
+    actor_schedule: str = "fixed",
+    env_restarts: int = 0,
     progress: bool = False,
     command: str | None = None,
 ) -> Result:
@@ -60,7 +64,9 @@ def train(
     defaults; ``preset="none"`` ignores presets. ``wrappers`` are those of ``thorndike.environments.wrappers``; ``network`` builds a
     network of your own. On compiled environments the seeds share the ``devices`` there are (cores, on a CPU), as far as their number
     divides; that changes how long it takes and no result. ``env_timeout`` is how many seconds a step of an environment in a process of
-    its own may take (60 by default), a reset twice that. Raises ``UserError`` for anything that cannot be.
+    its own may take (60 by default), a reset twice that. ``actor_threads`` play host environments while the learner learns, each a pool of
+    ``num_envs`` of its own, on the ``fixed`` schedule, which can be repeated, or the ``free`` one; ``env_restarts`` is how often a pool may
+    be made anew after a fault. Raises ``UserError`` for anything that cannot be.
     """
     check_algorithm(algorithm)
     if not 0 <= seed < 2**32 or seeds < 1:
@@ -69,7 +75,8 @@ def train(
     if algorithm == "planning":
         return plan_run(choice, settings or {}, output, name, command)
     found = find_preset(algorithm, choice.id, preset)
-    request = full_request(algorithm, choice, found, wrappers, settings or {}, steps, num_envs, seeds, seed, checkpoint_every)
+    actors = ActorThreads(actor_threads, actor_schedule, env_restarts)
+    request = full_request(algorithm, choice, found, wrappers, settings or {}, steps, num_envs, seeds, seed, checkpoint_every, actors)
     prepare_devices(choice, seeds, devices)
     backend = startup.choose_device(device, is_large(algorithm, choice))
     job = build_job(request, choice, wrappers, network, env_timeout, devices=startup.device_count(devices))
@@ -105,6 +112,8 @@ def resume(
         if steps is not None:
             request = request._replace(steps=steps)
         _need_checkpoint(run)
+        if request.actors is not None and request.actors.get("schedule") == "free":
+            notice(f"the actor threads of {run} run freely: what is trained from here on is not bit for bit what it would have been")
         with closing(rebuild(record, request, run, objects, env_timeout)) as job:
             start = _restored(run, job)
             record = {**record, **as_json(request), "status": "running"}

@@ -71,6 +71,9 @@ def run(words: Sequence[str]) -> Answer:
         checkpoint_every=options.checkpoint_every,
         max_episode_steps=options.max_episode_steps,
         env_kwargs=env_kwargs,
+        actor_threads=options.actor_threads,
+        actor_schedule=options.actor_schedule,
+        env_restarts=options.env_restarts,
         progress=not options.json,
         command=shlex.join(["thorndike", "train", *words]),
     )
@@ -218,6 +221,15 @@ def _parse(words: Sequence[str]) -> Namespace:
     add_output_argument(parser)
     parser.add_argument("--name", help="the last part of the run directory's name")
     parser.add_argument("--checkpoint-every", type=positive_whole, metavar="STEPS", help="steps between two checkpoints")
+    parser.add_argument(
+        "--actor-threads", type=positive_whole, default=0, metavar="N", help="threads that step host environments while the learner learns"
+    )
+    parser.add_argument(
+        "--actor-schedule", choices=("fixed", "free"), default="fixed", help="take their rollouts in turn, or as they come (default: fixed)"
+    )
+    parser.add_argument(
+        "--env-restarts", type=positive_whole, default=0, metavar="N", help="faults after which a thread's environments are made anew"
+    )
     return parser.parse(words)
 
 

@@ -3,12 +3,33 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from thorndike.types import Number
+from thorndike.types import Metrics, Number
 
 
 def weighted_mean(x: Float[Array, "*B"], weight: Float[Array, "*B"]) -> Float[Array, ""]:
     """Mean of ``x`` over the rows of non-zero ``weight``; 0 if there is none."""
     return jnp.sum(x * weight) / jnp.maximum(jnp.sum(weight), 1e-8)
+
+
+def actor_critic_loss(
+    log_prob: Float[Array, "*B"],
+    entropy: Float[Array, "*B"],
+    value: Float[Array, "*B"],
+    advantage: Float[Array, "*B"],
+    target: Float[Array, "*B"],
+    weight: Float[Array, "*B"],
+    vf_coef: Number,
+    ent_coef: Number,
+) -> tuple[Float[Array, ""], Metrics]:
+    """The loss of an advantage actor-critic, and its terms. Mnih et al. 2016 (arXiv:1602.01783), section 4.
+
+    The caller has stopped the gradients of advantages and targets.
+    """
+    policy = -weighted_mean(log_prob * advantage, weight)
+    critic = weighted_mean(jnp.square(value - target), weight)
+    mean_entropy = weighted_mean(entropy, weight)
+    loss = policy + vf_coef * critic - ent_coef * mean_entropy
+    return loss, {"train/loss": loss, "train/policy_loss": policy, "train/value_loss": critic, "train/entropy_loss": -mean_entropy}
 
 
 def clipped_surrogate(

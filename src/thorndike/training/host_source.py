@@ -52,7 +52,7 @@ class HostSource(NamedTuple):
     """A ``Source`` whose functions lead with the seed axis, and the one move that compiled sources do not need."""
 
     source: Source
-    restart: Callable[[PyTree, int], HostSourceState]
+    restart: Callable[[PyTree, int], PyTree]
     """wrappers' statistics ``[S, ...]``, rollouts made -> the state that an uninterrupted run had there."""
 
 
@@ -76,6 +76,14 @@ class Pool(NamedTuple):
         return x.reshape((self.seeds, self.num_envs, *x.shape[1:]))
 
 
+class Stepping(Protocol):
+    """What a rollout needs of a pool."""
+
+    def step(self, action: Array) -> Step:
+        """Actions ``[S, B, ...]`` -> Step ``[S, B, ...]``."""
+        ...
+
+
 class Tally:
     """Running returns and lengths of the pool's episodes ``[S, B]``, of the environments' own rewards."""
 
@@ -83,6 +91,10 @@ class Tally:
         """Start from the episodes under way."""
         self.total, self.age = episode_return.copy(), episode_length.copy()
         self.sums = np.zeros((4, *self.total.shape[:1]), np.float32)
+
+    def forget(self) -> None:
+        """The episodes under way will not be finished."""
+        self.total[:], self.age[:] = 0.0, 0
 
     def add(self, step: Step) -> None:
         """Count a step; episodes that end in it are summed up and start again from 0."""
@@ -93,13 +105,13 @@ class Tally:
         self.total[done], self.age[done] = 0.0, 0
 
 
-def environment_seeds(seed: int, indices: Sequence[int], num_envs: int, stream: int) -> list[int]:
+def environment_seeds(seed: int, indices: Sequence[int], num_envs: int, *stream: int) -> list[int]:
     """One seed for each of ``len(indices) x num_envs`` environments.
 
     Seeds have 31 bits, the most that every environment takes, and follow from all arguments by hashing: among n of them n^2 / 2^32 pairs
     are equal by chance.
     """
-    words = [np.random.SeedSequence([seed, index, stream]).generate_state(num_envs) for index in indices]
+    words = [np.random.SeedSequence([seed, index, *stream]).generate_state(num_envs) for index in indices]
     return [int(word) >> 1 for word in np.concatenate(words)]
 
 
@@ -119,9 +131,7 @@ def host_source(
 
     def start(statistics: PyTree, collected: int) -> HostSourceState:
         obs = pool.reset(environment_seeds(seed, indices, spec.num_envs, collected // reseed_every))
-        wrapper_memory, seen = moves.first_sight(statistics, obs)
-        zeros = np.zeros((seeds, spec.num_envs), np.float32)
-        return HostSourceState(obs, seen, moves.fresh_memory(), wrapper_memory, statistics, zeros, zeros.astype(np.int32), collected)
+        return fresh_state(moves, statistics, obs, collected)
 
     def init(keys: Key[Array, " S"]) -> HostSourceState:
         del keys
@@ -131,21 +141,15 @@ def host_source(
     def collect(state: HostSourceState, actor: PyTree, noise: Noise) -> tuple[HostSourceState, Rollout, EpisodeStats]:
         collected = state.collected + 1
         ends_segment = collected % reseed_every == 0
-        after, rows, tally = _roll(moves, pool, state, actor, noise, length)
+        rolling = Rolling(moves, state)
+        rolling.advance(pool, actor, noise, length)
         if ends_segment:
-            rows[-1] = rows[-1]._replace(step=_cut(rows[-1].step))
-        rollout = jax.tree.map(_stack, *rows)._replace(memory=state.memory)
-        statistics, wrapper_memory, rollout = learn(state.statistics, after.wrapper_memory, rollout)
+            rolling.rows[-1] = cut(rolling.rows[-1])
+        statistics, wrapper_memory, rollout = learn(state.statistics, rolling.state.wrapper_memory, rolling.rollout())
+        episodes = EpisodeStats(*rolling.tally.sums)
         if ends_segment:
-            return start(statistics, collected), rollout, EpisodeStats(*tally.sums)
-        following = after._replace(
-            wrapper_memory=wrapper_memory,
-            statistics=statistics,
-            episode_return=tally.total,
-            episode_length=tally.age,
-            collected=collected,
-        )
-        return following, rollout, EpisodeStats(*tally.sums)
+            return start(statistics, collected), rollout, episodes
+        return rolling.state._replace(wrapper_memory=wrapper_memory, statistics=statistics, collected=collected), rollout, episodes
 
     source = Source(
         init=init,
@@ -158,28 +162,64 @@ def host_source(
     return HostSource(source, start)
 
 
-def _roll(
-    moves: Acting, pool: Pool, state: HostSourceState, actor: PyTree, noise: Noise, length: int
-) -> tuple[HostSourceState, list[Rollout], Tally]:
-    """``length`` steps: the observations and memories after them, a row a step, the tally of episodes."""
-    obs, seen, memory, wrapper_memory = state.obs, state.seen, state.memory, state.wrapper_memory
-    tally, rows = Tally(state.episode_return, state.episode_length), []
-    for t in range(length):
-        decision = moves.decide(actor, memory, seen, noise, np.int32(t))
-        raw = pool.step(decision.engine_action)
-        wrapper_memory, step = moves.see(state.statistics, wrapper_memory, obs, decision.engine_action, raw)
-        rows.append(Rollout(seen, decision.action, decision.extras, step, ()))
-        tally.add(raw)
-        memory = moves.forget(raw.done | ~raw.valid, decision.memory)
-        obs, seen = raw.obs, step.obs
-    return state._replace(obs=obs, seen=seen, memory=memory, wrapper_memory=wrapper_memory), rows, tally
+def fresh_state(moves: Acting, statistics: PyTree, obs: Observation, collected: int) -> HostSourceState:
+    """Where every environment begins an episode; ``obs`` are their first observations ``[S, B, ...]``."""
+    wrapper_memory, seen = moves.first_sight(statistics, obs)
+    zeros = np.zeros(jax.tree.leaves(obs)[0].shape[:2], np.float32)
+    return HostSourceState(obs, seen, moves.fresh_memory(), wrapper_memory, statistics, zeros, zeros.astype(np.int32), collected)
 
 
-def _cut(step: Step) -> Step:
-    """The same step as the last of its episodes."""
-    return step._replace(truncated=np.asarray(step.truncated) | ~np.asarray(step.terminated))
+class Rolling:
+    """A rollout under way. Where a step raises, it stands as after the last whole step."""
+
+    def __init__(self, moves: Acting, state: HostSourceState) -> None:
+        """Before its first step."""
+        self.state, self.rows, self.memory = state, list[Rollout](), state.memory
+        self.tally = Tally(state.episode_return, state.episode_length)
+        self._moves = moves
+
+    def advance(self, pool: Stepping, actor: PyTree, noise: Noise, length: int) -> None:
+        """Step until there are ``length`` rows."""
+        moves, statistics = self._moves, self.state.statistics
+        obs, seen, memory, wrapper_memory = self.state.obs, self.state.seen, self.state.memory, self.state.wrapper_memory
+        try:
+            for t in range(len(self.rows), length):
+                decision = moves.decide(actor, memory, seen, noise, np.int32(t))
+                raw = pool.step(decision.engine_action)
+                wrapper_memory, step = moves.see(statistics, wrapper_memory, obs, decision.engine_action, raw)
+                self.rows.append(Rollout(seen, decision.action, decision.extras, step, ()))
+                self.tally.add(raw)
+                memory = moves.forget(raw.done | ~raw.valid, decision.memory)
+                obs, seen = raw.obs, step.obs
+        finally:
+            self.state = self.state._replace(
+                obs=obs,
+                seen=seen,
+                memory=memory,
+                wrapper_memory=wrapper_memory,
+                episode_return=self.tally.total,
+                episode_length=self.tally.age,
+            )
+
+    def begin_again(self, obs: Observation) -> None:
+        """Go on with other environments, whose first observations are ``obs``: the episodes under way are cut where they stood."""
+        self.state = fresh_state(self._moves, self.state.statistics, obs, self.state.collected)
+        self.tally.forget()
+        if self.rows:
+            self.rows[-1] = cut(self.rows[-1])
+        else:
+            self.memory = self.state.memory
+
+    def rollout(self) -> Rollout:
+        """The rows ``[S, T, B, ...]``."""
+        return jax.tree.map(_stack, *self.rows)._replace(memory=self.memory)
+
+
+def cut(rows: Rollout) -> Rollout:
+    """The same row, or rows, with every episode that did not end there cut."""
+    step = rows.step
+    return rows._replace(step=step._replace(truncated=np.asarray(step.truncated) | ~np.asarray(step.terminated)))
 
 
 def _stack(*rows: Array | np.ndarray) -> np.ndarray:
-    """Rows ``[S, B, ...]`` of T steps to ``[S, T, B, ...]``."""
     return np.stack([np.asarray(row) for row in rows], axis=1)
