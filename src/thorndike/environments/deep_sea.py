@@ -1,10 +1,10 @@
 """DeepSea-v0: a dive that pays only after N right moves in a row, in plain NumPy: what evaluation and films play, whatever trains.
 
 Osband et al. 2019, "Behaviour Suite for Reinforcement Learning" (arXiv:1908.03568), its deterministic task; first in Osband, Van Roy,
-Russo and Wen 2019, "Deep Exploration via Randomized Value Functions" (arXiv:1703.07608). A diver starts at the top left of an N x N grid and sinks
-one row a step, one column to the left or to the right. Which of the two actions means right is drawn once for each cell. A move to the
-right costs 0.01 / N; the last of N right moves is worth 1. So the best return is 0.99, staying left gives 0, and random actions find the
-treasure in one of 2^N episodes. The actions of the cells are those that bsuite draws with the same ``mapping_seed``.
+Russo and Wen 2019, "Deep Exploration via Randomized Value Functions" (arXiv:1703.07608). A diver starts at the top left of an N x N grid
+and sinks one row a step, one column to the left or to the right. Which of the two actions means right is drawn once for each cell. A move
+to the right costs 0.01 / N; the last of N right moves is worth 1. So the best return is 0.99, staying left gives 0, and random actions
+find the treasure in one of 2^N episodes. The actions of the cells are those that bsuite draws with the same ``mapping_seed``.
 """
 
 from typing import Literal

@@ -14,7 +14,7 @@ class ReplayBuffer(NamedTuple):
     """The ring. Rows ``[N, B]`` are stored flat, ``[N * B, ...]``, row ``t * B + b``."""
 
     rows: PyTree
-    """obs, action, reward, next_obs, terminated, done, valid, the memory an action was chosen with, an ensemble's mask: ``[N * B, ...]``."""
+    """obs, action, reward, next_obs, terminated, done, valid, the memory an action was chosen with, ensemble's mask: ``[N * B, ...]``."""
     position: Int[Array, ""]
     """The step written next, in ``[0, N)``."""
     size: Int[Array, ""]

@@ -13,6 +13,9 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from thorndike.types import Action, Algorithm, Environment, EpisodeStats, Noise, Observation, Rollout, Source, Step, Wrapper
 
+FOR_WRAPPERS = 0x57524150
+"""Separates the wrappers' own random numbers from those of the environments, which follow from the same key."""
+
 
 class SourceState(NamedTuple):
     """What a rollout carries to the next one."""
@@ -101,7 +104,7 @@ def compiled_source(environment: Environment, algorithm: Algorithm, wrapper: Wra
 
     def init(key: Key[Array, ""]) -> SourceState:
         state, obs = environment.init(key)
-        statistics = wrapper.statistics(spec)
+        statistics = wrapper.randomize(wrapper.statistics(spec), jax.random.fold_in(key, FOR_WRAPPERS))
         wrapper_memory, seen = wrapper.init(statistics, obs)
         zeros = jnp.zeros((spec.num_envs,), jnp.float32)
         return SourceState(
