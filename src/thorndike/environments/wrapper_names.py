@@ -4,7 +4,7 @@ import ast
 import importlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import MappingProxyType
+from types import MappingProxyType, NoneType
 from typing import TYPE_CHECKING
 
 from thorndike.errors import UserError
@@ -28,7 +28,15 @@ MODULES: Mapping[str, str] = MappingProxyType(
 )
 """Name -> the module of the function of that name."""
 _KINDS: Mapping[str, tuple[tuple[type, ...], str]] = MappingProxyType(
-    {"int": ((int,), "a whole number"), "float": ((int, float), "a number"), "tuple[int, ...]": ((tuple, list), "a list such as (64, 64)")}
+    {
+        "int": ((int,), "a whole number"),
+        "float": ((int, float), "a number"),
+        "tuple[int, ...]": ((tuple, list), "a list such as (64, 64)"),
+        "Sequence[int]": ((tuple, list), "a list such as [0, 2]"),
+        "Sequence[float]": ((tuple, list), "a list such as [0.5, 2.0]"),
+        "int | Sequence[int]": ((int, tuple, list), "a whole number or a list such as [6, 8]"),
+        "Bound": ((int, float, tuple, list, NoneType), "a number, a list such as [0.5, 2.0], or None"),
+    }
 )
 
 

@@ -299,7 +299,13 @@ def exported(wrapper: Wrapper, statistics: PyTree) -> Exported:
 
 def from_settings(settings: Sequence[Mapping]) -> Wrapper:
     """The chain that a list of ``Wrapper.settings`` describes. Raises UserError for a name that has no wrapper."""
-    return chain(*(_from_one(dict(part)) for part in settings if part))
+    return chain(*(build_wrapper(part) for part in settings if part))
+
+
+def build_wrapper(settings: Mapping) -> Wrapper:
+    """The wrapper that a ``Wrapper.settings`` describes. Raises UserError for a name that has no wrapper."""
+    values = {key: value for key, value in settings.items() if key != "name"}
+    return from_settings(values["parts"]) if settings.get("name") == "chain" else builder(str(settings.get("name")))(**values)
 
 
 def wrap(environment: Environment, wrapper: Wrapper) -> Environment:
@@ -341,11 +347,6 @@ def _of_view(
         return memory, step._replace(obs=view(statistics, step.obs), next_obs=view(statistics, step.next_obs))
 
     return Wrapper(name, settings, spec, statistics, lambda statistics, obs: ((), view(statistics, obs)), step, learn_nothing)
-
-
-def _from_one(part: dict) -> Wrapper:
-    name = part.pop("name", None)
-    return from_settings(part["parts"]) if name == "chain" else builder(str(name))(**part)
 
 
 def _plain(value: int | float | Sequence[int] | Sequence[float | None] | None) -> object:
