@@ -178,7 +178,24 @@ def test_links_lead_to_files_and_headings(document):
 
 
 @pytest.mark.parametrize(
-    "algorithm", ["ppo", "dqn", "rainbow", "qr_dqn", "iqn", "pqn", "a2c", "reinforce", "sac", "td3", "ddpg", "tqc", "crossq", "redq"]
+    "algorithm",
+    [
+        "ppo",
+        "dqn",
+        "rainbow",
+        "qr_dqn",
+        "iqn",
+        "pqn",
+        "bootstrapped_dqn",
+        "a2c",
+        "reinforce",
+        "sac",
+        "td3",
+        "ddpg",
+        "tqc",
+        "crossq",
+        "redq",
+    ],
 )
 def test_the_table_of_settings_is_that_of_the_code(algorithm):
     text = (ROOT / f"docs/algorithms/{algorithm}.md").read_text(encoding="utf-8")

@@ -97,22 +97,20 @@ class Row(NamedTuple):
 
 
 class State(NamedTuple):
-    """The learner."""
+    """The learner; ``epsilon`` is the chance of a random action where it falls by episodes."""
 
     tables: Tables
     pending: PyTree
     """SARSA's last transition of each environment, waiting for its next action."""
     epsilon: Float[Array, ""]
-    """The chance of a random action where it falls by episodes."""
     iteration: Int[Array, ""]
 
 
 class Actor(NamedTuple):
-    """What acting needs."""
+    """What acting needs; ``epsilon`` is the temperature of Boltzmann exploration."""
 
     q: Float[Array, "states tables*actions"]
     epsilon: Float[Array, ""]
-    """The chance of a random action, or the temperature."""
     visits: PyTree[Int[Array, "states actions"]]
 
 
