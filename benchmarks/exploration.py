@@ -42,12 +42,12 @@ class Task(NamedTuple):
     contestants: tuple[Contestant, ...]
 
 
-DEEP = "--set train_freq=4 --set target_update_interval=16 --set learning_rate=1e-3 --set batch_size=128 --set double=true"
+DEEP = "--set train_freq=4 --set target_update_interval=16 --set learning_rate=1e-3 --set batch_size=64 --set double=false"
 GRID = "--steps 1M --seeds 3 --num-envs 16 --set n_steps=128 --set batch_size=512 --set learning_rate=5e-4 --set ent_coef=0.01"
 TASKS = {
     "deep_sea": Task(
         "DeepSea-v0",
-        "--env-set size=20 --steps 32k --seeds 10 --num-envs 4",
+        "--env-set size=20 --steps 28k --seeds 10 --num-envs 4",
         0.5,
         (
             Contestant("bootstrapped DQN with priors", "bootstrapped_dqn", f"{DEEP} --set prior_scale=20"),
@@ -129,9 +129,8 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=ROOT / "runs", help="where the runs are made")
     parser.add_argument("--tables", action="store_true", help="only write the tables")
     options = parser.parse_args()
-    for name, task in () if options.tables else TASKS.items():
-        if options.task not in (None, name):
-            continue
+    chosen = {} if options.tables else {name: task for name, task in TASKS.items() if options.task in (None, name)}
+    for name, task in chosen.items():
         results = []
         for contestant in task.contestants:
             results.append(measure(task, contestant, options.output))
