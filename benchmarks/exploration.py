@@ -42,7 +42,7 @@ class Task(NamedTuple):
     contestants: tuple[Contestant, ...]
 
 
-DEEP = "--set train_freq=4 --set target_update_interval=16 --set learning_rate=1e-3 --set batch_size=64 --set double=false"
+DEEP = "--set net_arch=32,32 --set train_freq=4 --set target_update_interval=16 --set learning_rate=1e-3 --set batch_size=64 --set buffer_size=28000"
 GRID = "--steps 1M --seeds 3 --num-envs 16 --set n_steps=128 --set batch_size=512 --set learning_rate=5e-4 --set ent_coef=0.01"
 TASKS = {
     "deep_sea": Task(
@@ -50,8 +50,8 @@ TASKS = {
         "--env-set size=20 --steps 28k --seeds 10 --num-envs 4",
         0.5,
         (
-            Contestant("bootstrapped DQN with priors", "bootstrapped_dqn", f"{DEEP} --set prior_scale=20"),
-            Contestant("DQN, epsilon-greedy", "dqn", f"{DEEP} --set exploration_fraction=0.5 --set net_arch=50,50"),
+            Contestant("bootstrapped DQN with priors", "bootstrapped_dqn", f"{DEEP} --set prior_scale=20 --set double=false"),
+            Contestant("DQN, epsilon-greedy", "dqn", f"{DEEP} --set exploration_fraction=0.5"),
         ),
     ),
     "minigrid": Task(
@@ -106,9 +106,7 @@ def tables() -> None:
         file, start, end = RESULTS / f"{name}.json", f"<!-- {name}:start -->", f"<!-- {name}:end -->"
         if file.is_file() and start in text:
             rows = [_row(result) for result in json.loads(file.read_text())["results"]]
-            head = (
-                "| learner | steps | seeds that found it | median steps until then | final policy: mean, worst seed | CPU-s | command |"
-            )
+            head = "| learner | steps | seeds that found it | median steps until then | final policy: mean, worst seed | CPU-s | command |"
             before, after = text.split(start)[0], text.split(end)[1]
             text = before + start + "\n" + "\n".join([head, "|---" * 7 + "|", *rows]) + "\n" + end + after
     path.write_text(text)

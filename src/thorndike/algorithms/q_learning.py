@@ -156,8 +156,7 @@ def q_learning(config: Config, spec: EnvSpec) -> Algorithm:
         return (row[..., :actions] + row[..., actions:]) / 2.0 if double else row
 
     def act(actor: Actor, memory: PyTree, obs: PyTree, noise: Draws) -> tuple[PyTree, Int[Array, "*batch"], Extras]:
-        visits = actor.visits[number(obs)] if ucb else ()
-        choice = explore(how, values(actor, obs), actor.epsilon, visits, noise[0])
+        choice = explore(how, values(actor, obs), actor.epsilon, actor.visits[number(obs)] if ucb else (), noise[0])
         return memory, choice.action, Extras(choice.greedy, noise[1])
 
     def greedy(actor: Actor, memory: PyTree, obs: PyTree, noise: Draws) -> tuple[PyTree, Int[Array, "*batch"], Extras]:

@@ -70,22 +70,26 @@ def parse_wrapper(text: str) -> dict[str, object]:
 
 def _call(text: str) -> tuple[str, dict[str, object]]:
     try:
-        match ast.parse(text.strip(), mode="eval").body:
-            case ast.Name(id=name):
-                return name, {}
-            case ast.Call(func=ast.Name(id=name), args=[], keywords=keywords) if all(each.arg for each in keywords):
-                return name, {str(each.arg): ast.literal_eval(each.value) for each in keywords}
-    except (SyntaxError, ValueError, TypeError, MemoryError, RecursionError):
-        # All that Python's reader raises for what is not of this form: the answer below says what is.
-        pass
-    raise UserError(f"--wrap {text}: expected NAME or NAME(SETTING=VALUE, ...), for example --wrap 'count_bonus(coefficient=0.1)'")
+        return _parts(ast.parse(text.strip(), mode="eval").body)
+    except (SyntaxError, ValueError, TypeError, MemoryError, RecursionError) as error:
+        # All that Python's reader raises for what is not of this form.
+        example = "for example --wrap 'count_bonus(coefficient=0.1)'"
+        raise UserError(f"--wrap {' '.join(text.split())}: expected NAME or NAME(SETTING=VALUE, ...), {example}") from error
+
+
+def _parts(call: ast.expr) -> tuple[str, dict[str, object]]:
+    match call:
+        case ast.Name(id=name):
+            return name, {}
+        case ast.Call(func=ast.Name(id=name), args=[], keywords=keywords) if all(each.arg for each in keywords):
+            return name, {str(each.arg): ast.literal_eval(each.value) for each in keywords}
+    raise ValueError("another form")
 
 
 def _signature(name: str) -> tuple[dict[str, str], list[str]]:
     """The settings of a wrapper with their types as written, and those without a default, from the text of its file."""
     path = Path(__file__).parent / f"{MODULES[name].rpartition('.')[2]}.py"
     tree = ast.parse(path.read_text(encoding="utf-8"))
-    arguments = next(node.args for node in tree.body if isinstance(node, ast.FunctionDef) and node.name == name).args
-    known = {each.arg: ast.unparse(each.annotation) if each.annotation else "" for each in arguments}
-    function = next(node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name == name)
-    return known, list(known)[: len(known) - len(function.args.defaults)]
+    declared = next(node.args for node in tree.body if isinstance(node, ast.FunctionDef) and node.name == name)
+    known = {each.arg: ast.unparse(each.annotation) if each.annotation else "" for each in declared.args}
+    return known, list(known)[: len(known) - len(declared.defaults)]
