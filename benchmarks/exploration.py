@@ -42,7 +42,8 @@ class Task(NamedTuple):
     contestants: tuple[Contestant, ...]
 
 
-DEEP = "--set net_arch=32,32 --set train_freq=4 --set target_update_interval=16 --set learning_rate=1e-3 --set batch_size=64 --set buffer_size=28000"
+SIZES = "--set net_arch=32,32 --set batch_size=64 --set buffer_size=28000"
+DEEP = f"{SIZES} --set train_freq=4 --set target_update_interval=16 --set learning_rate=1e-3"
 GRID = "--steps 1M --seeds 3 --num-envs 16 --set n_steps=128 --set batch_size=512 --set learning_rate=5e-4 --set ent_coef=0.01"
 TASKS = {
     "deep_sea": Task(

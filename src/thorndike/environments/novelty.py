@@ -200,9 +200,9 @@ def _numbers(obs: Observation, moments: tuple[Moments, ...]) -> tuple[Float[Arra
     found = [
         # A Discrete space may start at any number: the remainder numbers its elements all the same.
         jax.nn.one_hot(leaf % shape[0], shape[0]) if leaf.ndim == 2 and len(shape) == 1 else leaf.astype(jnp.float32)
-        for leaf, shape in zip(leaves, shapes, strict=len(leaves) == len(shapes))
+        for leaf, shape in zip(leaves, shapes, strict=False)
     ]
-    if [row.shape[2:] for row in found] != shapes:
+    if len(leaves) != len(shapes) or [row.shape[2:] for row in found] != shapes:
         raise UserError("random_network_distillation looks at what the learner sees: put it after the wrappers that change the observation")
     return tuple(found)
 
