@@ -1,7 +1,7 @@
 """Exploration, measured: which learners find a reward that random actions do not.
 
     .venv/bin/python benchmarks/exploration.py deep_sea     # bootstrapped DQN with priors, and DQN with epsilon, on DeepSea of size 20
-    .venv/bin/python benchmarks/exploration.py minigrid     # PPO with bonuses for what is new, and without
+    .venv/bin/python benchmarks/exploration.py bonuses      # PPO with random network distillation and alone, on the same task
     .venv/bin/python benchmarks/exploration.py --tables     # only write the tables of docs/exploration.md
 
 Each writes benchmarks/results/exploration/<task>.json: the final greedy policies on fresh reference environments, the mean training return
@@ -44,7 +44,7 @@ class Task(NamedTuple):
 
 SIZES = "--set net_arch=32,32 --set batch_size=64 --set buffer_size=28000"
 DEEP = f"{SIZES} --set train_freq=4 --set target_update_interval=16 --set learning_rate=1e-3"
-GRID = "--steps 1M --seeds 3 --num-envs 16 --set n_steps=128 --set batch_size=512 --set learning_rate=5e-4 --set ent_coef=0.01"
+PPO = "--steps 240k --seeds 3 --num-envs 16 --set n_steps=60 --set batch_size=240 --set ent_coef=0.01 --set learning_rate=1e-3"
 TASKS = {
     "deep_sea": Task(
         "DeepSea-v0",
@@ -55,13 +55,12 @@ TASKS = {
             Contestant("DQN, epsilon-greedy", "dqn", f"{DEEP} --set exploration_fraction=0.5"),
         ),
     ),
-    "minigrid": Task(
-        "MiniGrid-DoorKey-8x8-v0",
-        GRID,
+    "bonuses": Task(
+        "DeepSea-v0",
+        f"--env-set size=20 {PPO}",
         0.5,
         (
-            Contestant("PPO with random network distillation", "ppo", "--wrap 'random_network_distillation(coefficient=0.3)'"),
-            Contestant("PPO with counts", "ppo", "--wrap 'count_bonus(coefficient=0.1)'"),
+            Contestant("PPO with random network distillation", "ppo", "--wrap random_network_distillation"),
             Contestant("PPO alone", "ppo", ""),
         ),
     ),

@@ -32,7 +32,7 @@ EXAMPLES = """\
   thorndike train ppo HalfCheetah-v5 --engine envpool --num-envs 8 --name first-try
   thorndike train q_learning FrozenLake-v1 --env-set is_slippery=False
   thorndike train ppo my_module:MyEnv-v0 --seeds 4 --json
-  thorndike train ppo MiniGrid-DoorKey-6x6-v0 --wrap random_network_distillation
+  thorndike train ppo DeepSea-v0 --wrap random_network_distillation
 
 every setting of an algorithm (`thorndike list settings ppo`) may also stand as a flag: --learning-rate 1e-3"""
 
