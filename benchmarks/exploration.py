@@ -1,7 +1,7 @@
 """Exploration, measured: which learners find a reward that random actions do not.
 
     .venv/bin/python benchmarks/exploration.py deep_sea     # bootstrapped DQN with priors, and DQN with epsilon, on DeepSea of size 20
-    .venv/bin/python benchmarks/exploration.py bonuses      # PPO with random network distillation and alone, on the same task
+    .venv/bin/python benchmarks/exploration.py bonuses      # PPO with random network distillation and alone, on size 10
     .venv/bin/python benchmarks/exploration.py --tables     # only write the tables of docs/exploration.md
 
 Each writes benchmarks/results/exploration/<task>.json: the final greedy policies on fresh reference environments, the mean training return
@@ -44,7 +44,7 @@ class Task(NamedTuple):
 
 SIZES = "--set net_arch=32,32 --set batch_size=64 --set buffer_size=28000"
 DEEP = f"{SIZES} --set train_freq=4 --set target_update_interval=16 --set learning_rate=1e-3"
-PPO = "--steps 240k --seeds 3 --num-envs 16 --set n_steps=60 --set batch_size=240 --set ent_coef=0.01 --set learning_rate=1e-3"
+PPO = "--steps 60k --seeds 5 --num-envs 16 --set n_steps=50 --set batch_size=200 --set ent_coef=0.01 --set learning_rate=1e-3"
 TASKS = {
     "deep_sea": Task(
         "DeepSea-v0",
@@ -57,7 +57,7 @@ TASKS = {
     ),
     "bonuses": Task(
         "DeepSea-v0",
-        f"--env-set size=20 {PPO}",
+        f"--env-set size=10 {PPO}",
         0.5,
         (
             Contestant("PPO with random network distillation", "ppo", "--wrap random_network_distillation"),
