@@ -180,7 +180,7 @@ def test_links_lead_to_files_and_headings(document):
 @pytest.mark.parametrize(
     "algorithm",
     [
-        *("ppo", "trpo", "a2c", "a3c", "impala", "reinforce", "dqn", "rainbow", "qr_dqn", "iqn", "pqn"),
+        *("ppo", "trpo", "a2c", "a3c", "impala", "reinforce", "dqn", "rainbow", "qr_dqn", "iqn", "pqn", "bootstrapped_dqn"),
         *("sac", "td3", "ddpg", "tqc", "crossq", "redq"),
     ],
 )

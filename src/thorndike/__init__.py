@@ -31,6 +31,7 @@ _PUBLIC = {
     "QRDQN": "thorndike.api",
     "IQN": "thorndike.api",
     "PQN": "thorndike.api",
+    "BootstrappedDQN": "thorndike.api",
     "DDPG": "thorndike.api",
     "TD3": "thorndike.api",
     "SAC": "thorndike.api",

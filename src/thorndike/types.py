@@ -150,6 +150,11 @@ class Algorithm(NamedTuple):
     needs: Needs
 
 
+def _as_they_are(statistics: PyTree, key: Key[Array, ""]) -> PyTree:
+    del key
+    return statistics
+
+
 class Wrapper(NamedTuple):
     """A change to what the learner sees, as pure functions over a stream of steps: it works on every engine.
 
@@ -169,6 +174,8 @@ class Wrapper(NamedTuple):
     """statistics, memory, the unwrapped obs acted on, action, Step -> memory, Step as the learner sees it."""
     learn: Callable[[PyTree, PyTree, Rollout], tuple[PyTree, PyTree, Rollout]]
     """statistics, memory, rollout as ``step`` made it -> statistics, memory, rollout: once a rollout, all ``[T, B]`` rows at once."""
+    randomize: Callable[[PyTree, Key[Array, ""]], PyTree] = _as_they_are
+    """initial statistics, key -> those that a seed begins with, where some of them are random. Consumes the key."""
 
 
 class Source(NamedTuple):

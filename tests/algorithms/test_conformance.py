@@ -12,6 +12,7 @@ import pytest
 from thorndike.algorithms import (
     a2c,
     a3c,
+    bootstrapped_dqn,
     crossq,
     ddpg,
     dqn,
@@ -29,7 +30,7 @@ from thorndike.algorithms import (
     tqc,
     trpo,
 )
-from thorndike.environments import wrappers
+from thorndike.environments import novelty, wrappers
 from thorndike.environments.native import factory
 from thorndike.environments.native.vectorize import vectorize
 from thorndike.networks.torso import example_observation
@@ -42,6 +43,7 @@ from thorndike.training.sources import compiled_source
 from thorndike.types import Algorithm, Source, Wrapper
 
 NUM_ENVS, SEEDS, ITERATIONS = 4, 3, 8
+NEW = (novelty.random_network_distillation(net_arch=(8,), features=4, batch_size=16), novelty.count_bonus(resolution=0.5, table_bits=8))
 NORMALISED = (wrappers.normalize_observation(), wrappers.normalize_reward(0.99))
 PPO = ppo.Config(total_steps=1000, n_steps=8, batch_size=16, n_epochs=2, net_arch=(8,), learning_rate="linear(1e-3, 0)")
 DQN = dqn.Config(
@@ -91,6 +93,8 @@ RUN = {
     "dqn": Case(dqn.dqn, parts(DQN, double=True, dueling=True, n_step=3), "CartPole-v1"),
     "rainbow": Case(rainbow.rainbow, rainbow.Config(**OF_THE_FAMILY, atoms=11), "CartPole-v1"),
     "pqn": Case(pqn.pqn, pqn.Config(total_steps=1000, n_steps=8, batch_size=16, n_epochs=2, net_arch=(8,)), "CartPole-v1"),
+    "bootstrapped_dqn": Case(bootstrapped_dqn.bootstrapped_dqn, bootstrapped_dqn.Config(**OF_THE_FAMILY, n_members=3), "CartPole-v1"),
+    "ppo, bonuses": Case(ppo.ppo, PPO, "CartPole-v1", NEW),
     "q_learning": Case(q_learning.q_learning, parts(TABLE, variant="sarsa"), "MountainCar-v0", BINS),
 }
 ALL = RUN | {
@@ -121,10 +125,15 @@ ALL = RUN | {
         dqn.dqn, parts(DQN, memory="gru", memory_size=8, sequence_length=4, noisy=True, distribution="quantile"), "CartPole-v1"
     ),
     "dqn, munchausen, resets": Case(dqn.dqn, parts(DQN, munchausen=True, reset_every=40, tau=0.1, gradient_steps=-1), "CartPole-v1"),
+    "dqn, boltzmann": Case(dqn.dqn, parts(DQN, exploration="boltzmann"), "CartPole-v1", NEW),
     "dqn, plain": Case(dqn.dqn, parts(DQN, learning_rate="exponential(1e-3, 1e-4)"), "CartPole-v1"),
     **{
         f"q_learning, {variant}": Case(q_learning.q_learning, parts(TABLE, variant=variant, visits_power=0.5), "MountainCar-v0", BINS)
         for variant in ("q_learning", "expected_sarsa", "double_q", "q_lambda")
+    },
+    **{
+        f"q_learning, {how}": Case(q_learning.q_learning, parts(TABLE, exploration=how), "MountainCar-v0", BINS)
+        for how in ("boltzmann", "ucb")
     },
     "q_learning, decay by episodes": Case(q_learning.q_learning, parts(TABLE, exploration_decay=0.99), "MountainCar-v0", BINS),
 }
@@ -178,7 +187,7 @@ class Bound(NamedTuple):
     traces: list[str]
 
 
-SLOW = ("td3", "crossq", "dqn, lstm", "a2c, gru", "a3c, gru", "trpo", "pqn")
+SLOW = ("ppo, bonuses", "td3", "crossq", "dqn, lstm", "a2c, gru", "a3c, gru", "trpo", "pqn")
 """Cases whose machinery another one runs too."""
 
 

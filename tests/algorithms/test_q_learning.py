@@ -177,6 +177,34 @@ def test_epsilon_falls_linearly_over_its_part_of_the_run():
     np.testing.assert_allclose(seen, [1.0, 0.55, 0.1, 0.1, 0.1], rtol=1e-6)
 
 
+def test_upper_confidence_tries_every_action_of_a_state_before_any_again():
+    algorithm = q_learning(settings("q_learning", exploration="ucb", ucb_coefficient=0.5), SPEC)
+    state, obs = algorithm.init(jax.random.key(0)), jnp.array([0, 2])
+    noise = jax.tree.map(lambda leaf: leaf[0], algorithm.draw(jax.random.key(1), 1))
+    rollout = random_rollout(0)
+    tried = rollout._replace(obs=jnp.zeros_like(rollout.obs), action=jnp.ones_like(rollout.action))
+    state, metrics = algorithm.update(state, tried, jax.random.key(2))
+    actor = algorithm.actor(state)
+    np.testing.assert_array_equal(actor.visits, [[0, int(rollout.step.valid.sum())], [0, 0], [0, 0]])
+    assert metrics["rollout/exploration_rate"] == 0
+    assert algorithm.act(actor, (), obs, noise)[1][0] == 0, "whatever the other one is worth"
+    untried = actor._replace(q=actor.q.at[0].set(jnp.array([5.0, 0.0])), visits=jnp.array([[90, 2], [0, 0], [0, 0]]))
+    expected = 5.0 + 0.5 * np.sqrt(np.log(92) / 90) < 0.5 * np.sqrt(np.log(92) / 2)
+    assert algorithm.act(untried, (), obs, noise)[1][0] == int(expected)
+
+
+def test_boltzmann_exploration_follows_its_temperature_and_on_policy_targets_refuse_it():
+    algorithm = q_learning(settings("q_lambda", exploration="boltzmann", temperature="linear(2, 1)"), SPEC)
+    state = algorithm.init(jax.random.key(0))
+    assert algorithm.actor(state).epsilon == 2.0
+    state, metrics = algorithm.update(state, random_rollout(0), jax.random.key(2))
+    assert metrics["rollout/exploration_rate"] == 2.0
+    assert 1.9 < algorithm.actor(state).epsilon < 2.0
+    for variant in ("sarsa", "expected_sarsa"):
+        with pytest.raises(UserError, match="set exploration to epsilon"):
+            settings(variant, exploration="ucb")
+
+
 def test_the_greedy_policy_takes_the_best_action_and_the_value_is_its_own():
     space = Tuple((Discrete(2), Discrete(2)))
     algorithm = q_learning(settings("q_learning"), SPEC._replace(observation_space=space, action_space=Discrete(2, start=3)))

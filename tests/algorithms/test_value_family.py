@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from algorithms.small_environments import recall
-from thorndike.algorithms import dqn, iqn, pqn, qr_dqn, rainbow
+from thorndike.algorithms import bootstrapped_dqn, dqn, iqn, pqn, qr_dqn, rainbow
 from thorndike.environments import wrappers
 from thorndike.environments.native import factory
 from thorndike.environments.native.vectorize import vectorize
@@ -84,6 +84,7 @@ def test_a_reset_renews_the_network_and_its_target_keeps_the_replay_and_leaves_t
     [
         (dqn, {"memory": "gru", "prioritized": True}, "prioritized to false"),
         (dqn, {"memory": "gru", "distribution": "implicit"}, "without memory"),
+        (dqn, {"noisy": True, "exploration": "boltzmann"}, "exploration to epsilon"),
         (dqn, {"munchausen": True, "n_step": 3}, "n_step to 1"),
         (iqn, {"munchausen": True, "double": True}, "double to false"),
         (dqn, {"munchausen": True, "distribution": "c51"}, "distribution to quantile"),
@@ -100,7 +101,7 @@ def test_parts_that_do_not_go_together_say_so_in_one_line(module, settings, says
     assert "\n" not in str(refusal.value)
 
 
-@pytest.mark.parametrize("module", [dqn, rainbow, qr_dqn, iqn, pqn])
+@pytest.mark.parametrize("module", [dqn, rainbow, qr_dqn, iqn, pqn, bootstrapped_dqn])
 def test_other_actions_than_discrete_are_refused(module):
     pendulum = vectorize(factory("Pendulum-v1")(), NUM_ENVS).spec
     name = module.__name__.rpartition(".")[2]

@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from thorndike.functional.exploration import epsilon_greedy
+from thorndike.functional.exploration import boltzmann, epsilon_greedy, optimistic, upper_confidence
 
 
 def slow_choice(q, epsilon, uniform, random_ties):
@@ -56,3 +56,40 @@ def test_the_largest_and_smallest_draws_are_actions():
     q = jnp.zeros((2, 3))
     action = epsilon_greedy(q, jnp.float32(0.0), jnp.array([0.0, np.nextafter(np.float32(1), np.float32(0))])).action
     np.testing.assert_array_equal(action, [0, 2])
+
+
+def test_boltzmann_equals_the_loop():
+    rng = np.random.default_rng(2)
+    q, uniform = rng.normal(size=(500, 4)).astype(np.float32), rng.random(500).astype(np.float32)
+    q[::7, 3] = -1e9
+    choice = jax.jit(boltzmann)(q, jnp.full((1,), 0.5), uniform)
+    for row, u, action, greedy in zip(q, uniform, choice.action, choice.greedy, strict=True):
+        odds = [np.exp((value - max(row)) / 0.5) for value in row]
+        place, wanted = 0.0, u * sum(odds)
+        expected = -1
+        while wanted >= place:
+            expected += 1
+            place += odds[expected]
+        assert action == expected or abs(wanted - place) < 1e-5 * sum(odds)
+        assert greedy == (row[action] == max(row))
+        assert row[action] > -1e8
+
+
+def test_boltzmann_at_the_ends_of_its_range():
+    last = np.nextafter(np.float32(1), np.float32(0))
+    q = jnp.tile(jnp.array([-1e9, 0.0, 1.0, -1e9]), (2, 1))
+    np.testing.assert_array_equal(boltzmann(q, jnp.ones(1), jnp.array([0.0, last])).action, [1, 2])
+    np.testing.assert_array_equal(boltzmann(q, jnp.full((1,), 1e-6), jnp.array([0.0, last])).action, [2, 2])
+
+
+def test_upper_confidence_equals_the_loop():
+    rng = np.random.default_rng(3)
+    q, visits = rng.normal(size=(200, 3)).astype(np.float32), rng.integers(0, 5, (200, 3)).astype(np.int32)
+    values = jax.jit(lambda q, n: upper_confidence(q, n, 0.7))(q, visits)
+    for row, counts, got in zip(q, visits, values, strict=True):
+        total = max(sum(counts), 1)
+        expected = [1e9 if n == 0 else value + 0.7 * np.sqrt(np.log(total) / n) for value, n in zip(row, counts, strict=True)]
+        np.testing.assert_allclose(got, expected, rtol=1e-5)
+    choice = optimistic(jnp.asarray(q), jnp.asarray(visits), 0.7, jnp.asarray(rng.random(200), jnp.float32))
+    assert all(got[action] == max(got) for got, action in zip(values, choice.action, strict=True))
+    np.testing.assert_array_equal(choice.greedy, [row[action] == max(row) for row, action in zip(q, choice.action, strict=True)])

@@ -45,6 +45,12 @@ ALGORITHMS: dict[str, Entry] = {
     "iqn": Entry(
         "thorndike.algorithms.iqn", "DQN on returns at random quantile levels; Munchausen; Discrete actions", ("Discrete",), num_envs=4
     ),
+    "bootstrapped_dqn": Entry(
+        "thorndike.algorithms.bootstrapped_dqn",
+        "DQN that follows one of an ensemble with random priors each episode: deep exploration; Discrete actions",
+        ("Discrete",),
+        num_envs=4,
+    ),
     "pqn": Entry(
         "thorndike.algorithms.pqn", "Q-network without replay or target, many environments; Discrete actions", ("Discrete",), num_envs=16
     ),

@@ -4,7 +4,7 @@ Mnih et al. 2015, "Human-level control through deep reinforcement learning" (Nat
 arXiv:1509.06461), dueling (Wang et al. 2016, arXiv:1511.06581), n-step and all of Rainbow (Hessel et al. 2018, arXiv:1710.02298),
 prioritised replay (Schaul et al. 2016, arXiv:1511.05952), noisy layers (Fortunato et al. 2018, arXiv:1706.10295), distributions of
 returns (functional/distributional.py), Munchausen (Vieillard et al. 2020, arXiv:2007.14430), memory (Kapturowski et al. 2019, R2D2),
-periodic resets (Nikishin et al. 2022, arXiv:2205.07802). Deviations from Mnih:
+periodic resets (Nikishin et al. 2022, arXiv:2205.07802), Boltzmann exploration (Sutton 1990). Deviations from Mnih:
 
 1. Adam with gradients clipped by their global norm, in place of RMSProp (as in Stable-Baselines3).
 2. A step cut by a time limit bootstraps from the observation it was cut at.
@@ -48,6 +48,8 @@ class Config:
     exploration_fraction: Annotated[float, MoreThan(0)] = 0.1  # share of the run over which epsilon falls
     exploration_initial_eps: Annotated[float, Between(0, 1)] = 1.0  # epsilon at the start
     exploration_final_eps: Annotated[float, Between(0, 1)] = 0.05  # epsilon at the end
+    exploration: Annotated[str, OneOf("epsilon", "boltzmann")] = "epsilon"  # explore by random actions, or by the values' exponentials
+    temperature: Annotated[float | str, MoreThan(0)] = "linear(1, 0.01)"  # of boltzmann: values are divided by it
     max_grad_norm: Annotated[float, MoreThan(0)] = 10.0  # global norm the gradient is clipped to
     adam_eps: Annotated[float, MoreThan(0)] = 1e-8  # Adam's epsilon
     double: bool = False  # choose the next action by the network, value it by the target
@@ -96,5 +98,6 @@ def dqn(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) ->
         munchausen=Munchausen(config.munchausen_alpha, config.munchausen_tau, config.munchausen_clip) if config.munchausen else None,
         memory=None if config.memory == "none" else Memory(config.memory, config.memory_size, config.sequence_length),
         reset_every=config.reset_every,
+        temperature=config.temperature if config.exploration == "boltzmann" else None,
     )
     return deep_q("dqn", config, options, spec, network)

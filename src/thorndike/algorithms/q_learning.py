@@ -26,11 +26,12 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from thorndike.errors import UserError
-from thorndike.functional.exploration import epsilon_greedy
+from thorndike.functional.exploration import Exploration, explore
 from thorndike.functional.row_by_row import row_by_row
-from thorndike.functional.schedules import schedule
+from thorndike.functional.schedules import Rate, schedule
 from thorndike.functional.state_index import state_index
 from thorndike.functional.temporal_difference import double_q_target, expected_sarsa_target, q_learning_target, sarsa_target, select
+from thorndike.functional.traces import Place, watkins
 from thorndike.settings import AtLeast, Between, MoreThan, check
 from thorndike.types import Algorithm, EnvSpec, Metrics, Needs, Rollout
 
@@ -49,13 +50,18 @@ class Config:
     exploration_final_eps: Annotated[float, Between(0, 1)] = 0.05  # the floor of epsilon
     exploration_fraction: Annotated[float, MoreThan(0), Between(0, 1)] = 0.5  # part of the run over which epsilon falls linearly
     exploration_decay: Annotated[float | None, Between(0, 1)] = None  # instead: epsilon is multiplied by this after every episode
+    exploration: Literal["epsilon", "boltzmann", "ucb"] = "epsilon"  # random actions, by exp(Q / temperature), or by optimism
+    temperature: Annotated[float | str, MoreThan(0)] = "linear(1, 0.01)"  # of boltzmann (tau)
+    ucb_coefficient: Annotated[float, AtLeast(0)] = 1.0  # of ucb: c in Q + c sqrt(ln N(s) / N(s, a))
     initial_value: float = 0.0  # every action value at the start; optimistic values explore
     random_ties: bool = True  # whether ties between best actions are broken at random
     n_steps: Annotated[int, AtLeast(1)] = 1  # steps of each environment between two updates
 
     def __post_init__(self) -> None:
-        """Raise UserError for a value out of bounds."""
+        """Raise UserError for a value out of bounds, or a target that values another policy than the one that acts."""
         check(self)
+        if self.exploration != "epsilon" and self.variant in ("sarsa", "expected_sarsa"):
+            raise UserError(f"q_learning: {self.variant} values epsilon-greedy actions: set exploration to epsilon, not {self.exploration}")
 
 
 class Tables(NamedTuple):
@@ -91,21 +97,21 @@ class Row(NamedTuple):
 
 
 class State(NamedTuple):
-    """The learner."""
+    """The learner; ``epsilon`` is the chance of a random action where it falls by episodes."""
 
     tables: Tables
     pending: PyTree
     """SARSA's last transition of each environment, waiting for its next action."""
     epsilon: Float[Array, ""]
-    """The chance of a random action where it falls by episodes."""
     iteration: Int[Array, ""]
 
 
 class Actor(NamedTuple):
-    """What acting needs."""
+    """What acting needs; ``epsilon`` is the temperature of Boltzmann exploration."""
 
     q: Float[Array, "states tables*actions"]
     epsilon: Float[Array, ""]
+    visits: PyTree[Int[Array, "states actions"]]
 
 
 class Extras(NamedTuple):
@@ -128,7 +134,8 @@ def q_learning(config: Config, spec: EnvSpec) -> Algorithm:
         raise UserError(f"q_learning would need a table of {states} states x {actions} actions for {spec.id}: use fewer bins, or dqn")
     learn, rate = row_by_row(_learner(config, (states, actions, spec.num_envs))), schedule(config.learning_rate)
     last_iteration = max(config.total_steps // (config.n_steps * spec.num_envs), 1)
-    double, sarsa = config.variant == "double_q", config.variant == "sarsa"
+    double, sarsa, ucb = config.variant == "double_q", config.variant == "sarsa", config.exploration == "ucb"
+    how = Exploration(config.exploration, config.ucb_coefficient, config.random_ties)
 
     def init(key: Key[Array, ""]) -> State:
         kinds = (jnp.int32, jnp.int32, jnp.float32, jnp.int32, jnp.bool, jnp.bool, jnp.bool)
@@ -149,7 +156,7 @@ def q_learning(config: Config, spec: EnvSpec) -> Algorithm:
         return (row[..., :actions] + row[..., actions:]) / 2.0 if double else row
 
     def act(actor: Actor, memory: PyTree, obs: PyTree, noise: Draws) -> tuple[PyTree, Int[Array, "*batch"], Extras]:
-        choice = epsilon_greedy(values(actor, obs), actor.epsilon, noise[0], random_ties=config.random_ties)
+        choice = explore(how, values(actor, obs), actor.epsilon, actor.visits[number(obs)] if ucb else (), noise[0])
         return memory, choice.action, Extras(choice.greedy, noise[1])
 
     def greedy(actor: Actor, memory: PyTree, obs: PyTree, noise: Draws) -> tuple[PyTree, Int[Array, "*batch"], Extras]:
@@ -173,7 +180,7 @@ def q_learning(config: Config, spec: EnvSpec) -> Algorithm:
 
     return Algorithm(
         init=init,
-        actor=lambda state: Actor(state.tables.q, _epsilon(config, state.epsilon, progress(state))),
+        actor=lambda now: Actor(now.tables.q, _epsilon(config, now.epsilon, progress(now)), now.tables.visits if ucb else ()),
         memory=lambda batch: (),
         draw=draw,
         act=act,
@@ -187,15 +194,16 @@ def q_learning(config: Config, spec: EnvSpec) -> Algorithm:
 
 def _first_tables(config: Config, states: int, actions: int, num_envs: int) -> Tables:
     q = jnp.full((states, actions * (2 if config.variant == "double_q" else 1)), config.initial_value, jnp.float32)
-    visits = jnp.zeros((states, actions), jnp.int32) if config.visits_power > 0 else ()
+    visits = jnp.zeros((states, actions), jnp.int32) if config.visits_power > 0 or config.exploration == "ucb" else ()
     return Tables(q, visits, jnp.zeros((num_envs, states, actions), jnp.float32) if config.variant == "q_lambda" else ())
 
 
 def _epsilon(config: Config, by_episodes: Float[Array, ""], progress: Float[Array, ""]) -> Float[Array, ""]:
+    if config.exploration != "epsilon":
+        return schedule(config.temperature if config.exploration == "boltzmann" else 0.0)(progress)
     if config.exploration_decay is not None:
         return by_episodes
-    fallen = jnp.minimum(progress / config.exploration_fraction, 1.0)
-    return config.exploration_initial_eps + fallen * (config.exploration_final_eps - config.exploration_initial_eps)
+    return schedule(Rate("linear", config.exploration_initial_eps, config.exploration_final_eps, config.exploration_fraction))(progress)
 
 
 def _learner(config: Config, sizes: tuple[int, int, int]) -> Callable[[Tables, Int[Array, ""], Row], tuple[Tables, Float[Array, ""]]]:
@@ -211,12 +219,14 @@ def _learner(config: Config, sizes: tuple[int, int, int]) -> Callable[[Tables, I
         error = jnp.where(now.valid, target - value, 0.0)
         # What is not finite is reported but not learnt: the table stays good.
         learnt, rate, visits = jnp.where(jnp.isfinite(error), error, 0.0), row.rate, tables.visits
-        if config.visits_power > 0:
+        if config.visits_power > 0 or config.exploration == "ucb":
             count = select(lax.dynamic_index_in_dim(visits, state, keepdims=False), now.action) + now.valid
             visits = lax.dynamic_update_slice(visits, count[None, None], (state, now.action))
             rate = rate * jnp.maximum(count, 1).astype(jnp.float32) ** -config.visits_power
         if config.variant == "q_lambda":
-            q, traces = _trace(config, tables, row, rate * learnt, (first, seed * num_envs + row.env))
+            place = Place(first, seed * num_envs + row.env, now.state, now.action)
+            fading, kept = jnp.where(row.greedy, config.gamma * config.trace_decay, 0.0), jnp.where(now.done | ~now.valid, 0.0, 1.0)
+            q, traces = watkins(tables.q, tables.traces, place, rate * learnt, fading, kept)
             return Tables(q, visits, traces), jnp.abs(error)
         q = lax.dynamic_update_slice(tables.q, (value + rate * learnt)[None, None], (state, column))
         return Tables(q, visits, ()), jnp.abs(error)
@@ -237,14 +247,3 @@ def _target(config: Config, row: Row, next_q: Float[Array, "tables*actions"]) ->
             return double_q_target(*outcome, jnp.where(row.coin, second, first), jnp.where(row.coin, first, second), config.gamma)
         case _:
             return q_learning_target(*outcome, next_q, config.gamma)
-
-
-def _trace(config: Config, tables: Tables, row: Row, change: Float[Array, ""], where: tuple[Array, Array]) -> tuple[Array, Array]:
-    """Watkins's traces: they fade by gamma * lambda, are cut by an exploring action, and carry the error to all that led here."""
-    (first, env), now = where, row.transition
-    trace = lax.dynamic_index_in_dim(tables.traces, env, keepdims=False)
-    trace = trace * jnp.where(row.greedy, config.gamma * config.trace_decay, 0.0)
-    trace = lax.dynamic_update_slice(trace, jnp.ones((1, 1), trace.dtype), (now.state, now.action))
-    own = lax.dynamic_slice_in_dim(tables.q, first, len(trace)) + change * trace
-    kept = jnp.where(now.done | ~now.valid, 0.0, 1.0) * trace
-    return lax.dynamic_update_slice_in_dim(tables.q, own, first, 0), lax.dynamic_update_index_in_dim(tables.traces, kept, env, 0)

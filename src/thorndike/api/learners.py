@@ -169,6 +169,12 @@ class IQN(Learner):
     algorithm = "iqn"
 
 
+class BootstrappedDQN(Learner):
+    """DQN that follows one member of an ensemble each episode."""
+
+    algorithm = "bootstrapped_dqn"
+
+
 class PQN(Learner):
     """Parallelised Q-network."""
 

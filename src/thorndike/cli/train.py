@@ -15,6 +15,7 @@ from thorndike.cli.answer import Answer
 from thorndike.cli.environment_names import check_environment
 from thorndike.cli.find_run import add_output_argument, exists
 from thorndike.cli.parser import Parser, positive_whole, seed_number
+from thorndike.environments.wrapper_names import parse_wrapper
 from thorndike.errors import UserError
 from thorndike.settings import FieldFacts, parse_settings, read_config_fields
 from thorndike.suggestions import did_you_mean
@@ -31,6 +32,7 @@ EXAMPLES = """\
   thorndike train ppo HalfCheetah-v5 --engine envpool --num-envs 8 --name first-try
   thorndike train q_learning FrozenLake-v1 --env-set is_slippery=False
   thorndike train ppo my_module:MyEnv-v0 --seeds 4 --json
+  thorndike train ppo DeepSea-v0 --wrap random_network_distillation
 
 every setting of an algorithm (`thorndike list settings ppo`) may also stand as a flag: --learning-rate 1e-3"""
 
@@ -52,7 +54,9 @@ def run(words: Sequence[str]) -> Answer:
         algorithm=algorithm,
     )
     check_preset(algorithm, environment, options.preset)
+    wrapper_settings = [parse_wrapper(text) for text in options.wrap]
     from thorndike.api import train
+    from thorndike.environments.wrappers import build_wrapper
 
     result = train(
         algorithm,
@@ -74,6 +78,7 @@ def run(words: Sequence[str]) -> Answer:
         actor_threads=options.actor_threads,
         actor_schedule=options.actor_schedule,
         env_restarts=options.env_restarts,
+        wrappers=[build_wrapper(each) for each in wrapper_settings] or None,
         progress=not options.json,
         command=shlex.join(["thorndike", "train", *words]),
     )
@@ -219,6 +224,13 @@ def _parse(words: Sequence[str]) -> Namespace:
     algorithm = named_algorithm(words)
     add_training_arguments(parser, read_config_fields(algorithm) if algorithm in ALGORITHMS else {})
     add_output_argument(parser)
+    parser.add_argument(
+        "--wrap",
+        action="append",
+        default=[],
+        metavar="WRAPPER",
+        help="a wrapper in place of the preset's, as in 'count_bonus(coefficient=0.1)'; may be repeated, the first nearest the environment",
+    )
     parser.add_argument("--name", help="the last part of the run directory's name")
     parser.add_argument("--checkpoint-every", type=positive_whole, metavar="STEPS", help="steps between two checkpoints")
     parser.add_argument(

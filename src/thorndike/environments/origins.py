@@ -22,6 +22,8 @@ from thorndike.errors import UserError
 Settings: TypeAlias = Mapping[str, object]
 """Keyword settings of an environment."""
 
+gymnasium.register("DeepSea-v0", "thorndike.environments.deep_sea:DeepSeaEnv")
+
 
 def is_known_id(name: str) -> bool:
     """Whether Gymnasium has this id, after importing the module of ``module:Id`` or the package of ``ALE/...`` or ``MinAtar/...``."""

@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from gymnasium import spaces
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float, Key, PyTree
 
 from thorndike.environments.observation_views import (
     Bound,
@@ -40,6 +40,7 @@ from thorndike.environments.observation_views import (
     space_leaves,
     stacked_space,
 )
+from thorndike.environments.wrapper_names import builder
 from thorndike.errors import UserError
 from thorndike.functional.normalization import (
     add_row,
@@ -51,7 +52,6 @@ from thorndike.functional.normalization import (
     running_returns,
     scale,
 )
-from thorndike.suggestions import did_you_mean
 from thorndike.types import Action, Environment, EnvSpec, Noise, Observation, Rollout, Step, Wrapper
 
 Batch: TypeAlias = Float[Array, "*batch"]
@@ -277,10 +277,16 @@ def chain(*wrappers: Wrapper) -> Wrapper:
             links.append(link._replace(memory=own_memory))
         return tuple(learnt), tuple(links), rollout
 
+    def randomize(statistics: PyTree, key: Key[Array, ""]) -> PyTree:
+        keys = jax.random.split(key, max(1, len(wrappers)))
+        return tuple(wrapper.randomize(own, keys[i]) for i, (wrapper, own) in enumerate(zip(wrappers, statistics, strict=True)))
+
     frozen = all(wrapper.learn is learn_nothing for wrapper in wrappers)
     settings = {"name": "chain", "parts": [wrapper.settings for wrapper in wrappers]}
     name = " + ".join(wrapper.name for wrapper in wrappers)
-    return Wrapper(name, settings, lambda env_spec: specs(env_spec)[-1], statistics, init, step, learn_nothing if frozen else learn)
+    return Wrapper(
+        name, settings, lambda env_spec: specs(env_spec)[-1], statistics, init, step, learn_nothing if frozen else learn, randomize
+    )
 
 
 def exported(wrapper: Wrapper, statistics: PyTree) -> Exported:
@@ -293,7 +299,13 @@ def exported(wrapper: Wrapper, statistics: PyTree) -> Exported:
 
 def from_settings(settings: Sequence[Mapping]) -> Wrapper:
     """The chain that a list of ``Wrapper.settings`` describes. Raises UserError for a name that has no wrapper."""
-    return chain(*(_from_one(dict(part)) for part in settings if part))
+    return chain(*(build_wrapper(part) for part in settings if part))
+
+
+def build_wrapper(settings: Mapping) -> Wrapper:
+    """The wrapper that a ``Wrapper.settings`` describes. Raises UserError for a name that has no wrapper."""
+    values = {key: value for key, value in settings.items() if key != "name"}
+    return from_settings(values["parts"]) if settings.get("name") == "chain" else builder(str(settings.get("name")))(**values)
 
 
 def wrap(environment: Environment, wrapper: Wrapper) -> Environment:
@@ -335,23 +347,6 @@ def _of_view(
         return memory, step._replace(obs=view(statistics, step.obs), next_obs=view(statistics, step.next_obs))
 
     return Wrapper(name, settings, spec, statistics, lambda statistics, obs: ((), view(statistics, obs)), step, learn_nothing)
-
-
-def _from_one(part: dict) -> Wrapper:
-    builders: dict[str, Callable[..., Wrapper]] = {
-        "centre_reward": centre_reward,
-        "discretise": discretise,
-        "normalize_observation": normalize_observation,
-        "normalize_reward": normalize_reward,
-        "frame_stack": frame_stack,
-        "select_observation": select_observation,
-    }
-    name = part.pop("name", None)
-    if name == "chain":
-        return from_settings(part["parts"])
-    if name not in builders:
-        raise UserError(f"no wrapper {name!r} can be built from settings{did_you_mean(str(name), builders)}")
-    return builders[name](**part)
 
 
 def _plain(value: int | float | Sequence[int] | Sequence[float | None] | None) -> object:

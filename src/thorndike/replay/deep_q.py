@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int, Key, PyTree
 
 from thorndike.errors import UserError
 from thorndike.functional.distributional import ReturnDistribution, expected_value
-from thorndike.functional.exploration import epsilon_greedy
+from thorndike.functional.exploration import boltzmann, epsilon_greedy
 from thorndike.functional.schedules import Rate, schedule
 from thorndike.functional.value_loss import Munchausen, Rule
 from thorndike.networks.heads import Shape
@@ -133,6 +133,8 @@ class Options(NamedTuple):
     memory: Memory | None = None
     reset_every: int = 0
     """Environment steps between new beginnings of the network; 0: never."""
+    temperature: Number | str | Rate | None = None
+    """Of Boltzmann exploration, or its schedule; None explores by epsilon."""
 
 
 class Actor(NamedTuple):
@@ -140,6 +142,7 @@ class Actor(NamedTuple):
 
     params: Float[Array, " P"]
     epsilon: Float[Array, ""]
+    """The chance of a random action, or the temperature of Boltzmann exploration."""
 
 
 class Noise(NamedTuple):
@@ -159,8 +162,8 @@ def deep_q(name: str, config: Settings, options: Options, spec: EnvSpec, network
     net, per_iteration = parts.net, plan.rollout_length * spec.num_envs
     learning_rate = schedule(config.learning_rate)
     falling = Rate("linear", config.exploration_initial_eps, config.exploration_final_eps, jnp.minimum(config.exploration_fraction, 1.0))
-    exploration = schedule(falling if options.noisy_sigma is None else 0.0)
-
+    by_chance = schedule(falling if options.noisy_sigma is None else 0.0)
+    exploration = by_chance if options.temperature is None else schedule(options.temperature)
     beta0 = 1.0 if options.priorities is None else options.priorities.beta0
 
     def actor(state: State) -> Actor:
@@ -176,8 +179,11 @@ def deep_q(name: str, config: Settings, options: Options, spec: EnvSpec, network
     def act(actor: Actor, memory: PyTree, obs: Observation, noise: Noise) -> tuple[PyTree, Int[Array, " B"], PyTree]:
         layers = noise.layers.numbers if isinstance(noise.layers, Shared) else jnp.zeros(0)
         later, outputs = apply_step(net.network, net.drawn(actor.params, layers), memory, obs)
-        mask = allowed(obs) if has_mask(spec.observation_space) else None
-        choice = epsilon_greedy(net.q(outputs, obs), actor.epsilon, noise.choice, random_ties=False, allowed=mask)
+        mask, q = allowed(obs) if has_mask(spec.observation_space) else None, net.q(outputs, obs)
+        if options.temperature is None:
+            choice = epsilon_greedy(q, actor.epsilon, noise.choice, random_ties=False, allowed=mask)
+        else:
+            choice = boltzmann(q, actor.epsilon[None], noise.choice)
         return later, choice.action, {"memory": memory}
 
     def greedy(actor: Actor, memory: PyTree, obs: Observation, noise: PyTree) -> tuple[PyTree, Int[Array, " B"], PyTree]:
@@ -185,7 +191,7 @@ def deep_q(name: str, config: Settings, options: Options, spec: EnvSpec, network
         return memory, jnp.argmax(net.q(outputs, obs), axis=-1).astype(jnp.int32), {}
 
     def observe(state: State, rollout: Rollout, key: Key[Array, ""]) -> tuple[State, Metrics]:
-        metrics = {"rollout/exploration_rate": actor(state).epsilon}
+        metrics = {f"rollout/{'exploration_rate' if options.temperature is None else 'temperature'}": actor(state).epsilon}
         return state._replace(replay=parts.replay.add(state.replay, rollout), env_steps=state.env_steps + per_iteration), metrics
 
     def update(state: State, rollout: Rollout, key: Key[Array, ""]) -> tuple[State, Metrics]:
@@ -253,5 +259,7 @@ def refuse_what_does_not_go_together(name: str, options: Options) -> None:
         raise UserError(f"{name} with memory learns from single steps: set n_step to 1, not {options.n_step}")
     if options.memory is not None and options.priorities is not None:
         raise UserError(f"{name} with memory learns from sequences drawn uniformly: set prioritized to false, or memory to none")
+    if options.temperature is not None and options.noisy_sigma is not None:
+        raise UserError(f"{name} with noisy layers explores by them alone: set exploration to epsilon, or noisy to false")
     if options.munchausen is not None and (options.n_step > 1 or options.double):
         raise UserError(f"{name} with munchausen has a target of its own, of single steps: set n_step to 1 and double to false")

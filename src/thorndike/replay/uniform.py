@@ -14,7 +14,7 @@ class ReplayBuffer(NamedTuple):
     """The ring. Rows ``[N, B]`` are stored flat, ``[N * B, ...]``, row ``t * B + b``."""
 
     rows: PyTree
-    """obs, action, reward, next_obs, terminated, done, valid, and the memory an action was chosen with: ``[N * B, ...]``."""
+    """obs, action, reward, next_obs, terminated, done, valid, the memory an action was chosen with, ensemble's mask: ``[N * B, ...]``."""
     position: Int[Array, ""]
     """The step written next, in ``[0, N)``."""
     size: Int[Array, ""]
@@ -33,10 +33,15 @@ class Transitions(NamedTuple):
     """What multiplies the bootstrap value: gamma^n, or 0 after a termination."""
     weight: Float[Array, " M"]
     """1, or 0 for a row that is no transition."""
+    mask: PyTree = ()
+    """Which members of an ensemble learn from it, where one stored that."""
 
 
-def row_shapes(spec: EnvSpec, memory: PyTree = ()) -> PyTree:
-    """One stored transition of an environment, as shapes and dtypes; ``memory`` is a recurrent state of one environment ``[1, ...]``."""
+def row_shapes(spec: EnvSpec, memory: PyTree = (), mask: PyTree = ()) -> PyTree:
+    """One stored transition of an environment, as shapes and dtypes; ``memory`` is a recurrent state of one environment ``[1, ...]``.
+
+    ``mask`` is the shape of an ensemble's bootstrap mask, where there is one.
+    """
     obs, action = (
         jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, jnp.asarray(x).dtype), space.sample())
         for space in (spec.observation_space, spec.action_space)
@@ -44,7 +49,7 @@ def row_shapes(spec: EnvSpec, memory: PyTree = ()) -> PyTree:
     flag, number = jax.ShapeDtypeStruct((), jnp.bool_), jax.ShapeDtypeStruct((), jnp.float32)
     remembered = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), memory)
     row = {"obs": obs, "action": action, "reward": number, "next_obs": obs, "terminated": flag, "done": flag, "valid": flag}
-    return row | {"memory": remembered}
+    return row | {"memory": remembered, "mask": mask}
 
 
 def init_replay(row: PyTree, steps: int, num_envs: int) -> ReplayBuffer:
@@ -55,7 +60,7 @@ def init_replay(row: PyTree, steps: int, num_envs: int) -> ReplayBuffer:
 
 def rows_of(rollout: Rollout) -> PyTree:
     """The part of a rollout that replay keeps, ``[T, B, ...]``."""
-    step = rollout.step
+    step, extras = rollout.step, rollout.extras if isinstance(rollout.extras, dict) else {}
     return {
         "obs": rollout.obs,
         "action": rollout.action,
@@ -64,7 +69,8 @@ def rows_of(rollout: Rollout) -> PyTree:
         "terminated": step.terminated,
         "done": step.done,
         "valid": step.valid,
-        "memory": rollout.extras["memory"] if isinstance(rollout.extras, dict) and "memory" in rollout.extras else (),
+        "memory": extras.get("memory", ()),
+        "mask": extras.get("mask", ()),
     }
 
 
@@ -101,15 +107,17 @@ def transitions_at(buffer: ReplayBuffer, index: Int[Array, " M"], num_envs: int,
     if n_step == 1:
         row = jax.tree.map(lambda x: x[index], buffer.rows)
         discount = jnp.where(row["terminated"], 0.0, gamma)
-        return Transitions(row["obs"], row["action"], row["reward"], row["next_obs"], discount, row["valid"].astype(jnp.float32))
+        return Transitions(
+            row["obs"], row["action"], row["reward"], row["next_obs"], discount, row["valid"].astype(jnp.float32), row["mask"]
+        )
     window = (index[None, :] + num_envs * jnp.arange(n_step, dtype=jnp.int32)[:, None]) % total
     reward, discount, last = n_step_return(
         buffer.rows["reward"][window], buffer.rows["terminated"][window], buffer.rows["done"][window], gamma
     )
     ending = (index + num_envs * last) % total
-    first = {name: jax.tree.map(lambda x: x[index], buffer.rows[name]) for name in ("obs", "action", "valid")}
+    first = {name: jax.tree.map(lambda x: x[index], buffer.rows[name]) for name in ("obs", "action", "valid", "mask")}
     next_obs = jax.tree.map(lambda x: x[ending], buffer.rows["next_obs"])
-    return Transitions(first["obs"], first["action"], reward, next_obs, discount, first["valid"].astype(jnp.float32))
+    return Transitions(first["obs"], first["action"], reward, next_obs, discount, first["valid"].astype(jnp.float32), first["mask"])
 
 
 def sample_sequences(buffer: ReplayBuffer, key: Key[Array, ""], count: int, length: int, num_envs: int) -> Rollout:

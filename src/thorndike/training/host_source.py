@@ -7,12 +7,11 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Key, PyTree
 
 from thorndike.training.acting import Acting, acting
-from thorndike.training.sources import by_iteration
+from thorndike.training.sources import FOR_WRAPPERS, by_iteration
 from thorndike.types import Algorithm, EnvSpec, EpisodeStats, Noise, Observation, Rollout, Source, Step, Wrapper
 
 
@@ -134,9 +133,10 @@ def host_source(
         return fresh_state(moves, statistics, obs, collected)
 
     def init(keys: Key[Array, " S"]) -> HostSourceState:
-        del keys
-        statistics = jax.tree.map(lambda x: jnp.broadcast_to(x, (seeds, *jnp.shape(x))), wrapper.statistics(spec))
-        return start(statistics, 0)
+        def one(key: Key[Array, ""]) -> PyTree:
+            return wrapper.randomize(wrapper.statistics(spec), jax.random.fold_in(key, FOR_WRAPPERS))
+
+        return start(jax.vmap(one)(keys), 0)
 
     def collect(state: HostSourceState, actor: PyTree, noise: Noise) -> tuple[HostSourceState, Rollout, EpisodeStats]:
         collected = state.collected + 1

@@ -15,6 +15,8 @@ from thorndike.types import Action, Algorithm, Environment, EpisodeStats, Noise,
 
 _SMALL_ROLLOUT = 16_384
 """Numbers in the observations of a rollout that is copied in no time."""
+FOR_WRAPPERS = 0x57524150
+"""Separates the wrappers' own random numbers from those of the environments, which follow from the same key."""
 
 
 class SourceState(NamedTuple):
@@ -112,7 +114,7 @@ def compiled_source(environment: Environment, algorithm: Algorithm, wrapper: Wra
 
     def init(key: Key[Array, ""]) -> SourceState:
         state, obs = environment.init(key)
-        statistics = wrapper.statistics(spec)
+        statistics = wrapper.randomize(wrapper.statistics(spec), jax.random.fold_in(key, FOR_WRAPPERS))
         wrapper_memory, seen = wrapper.init(statistics, obs)
         zeros = jnp.zeros((spec.num_envs,), jnp.float32)
         return SourceState(

@@ -20,6 +20,7 @@ NATIVE: Mapping[str, str] = MappingProxyType(
         "MountainCarContinuous-v0": "thorndike.environments.native.mountain_car:mountain_car_continuous",
         "Pendulum-v1": "thorndike.environments.native.pendulum:pendulum",
         "Blackjack-v1": "thorndike.environments.native.blackjack:blackjack",
+        "DeepSea-v0": "thorndike.environments.native.deep_sea:deep_sea",
         "MinAtar/Asterix-v0": "thorndike.environments.native.minatar.asterix:asterix",
         "MinAtar/Asterix-v1": "thorndike.environments.native.minatar.asterix:asterix_minimal",
         "MinAtar/Breakout-v0": "thorndike.environments.native.minatar.breakout:breakout",
