@@ -18,6 +18,7 @@ from thorndike.functional.critic_losses import lowest_atoms, quantile_errors
 from thorndike.functional.soft_policy import temperature
 from thorndike.networks.network import NetworkBuilder
 from thorndike.networks.torso import ACTIVATIONS
+from thorndike.replay.hindsight import STRATEGIES
 from thorndike.settings import AtLeast, Between, OneOf, check
 from thorndike.types import Algorithm, EnvSpec
 
@@ -43,6 +44,8 @@ class Config:
     n_critics: Annotated[int, AtLeast(1)] = 2  # K: critics of the ensemble
     layer_norm: bool = False  # normalise the critics' hidden layers
     noise_color: Annotated[float, AtLeast(0)] = 0.0  # exploration noise over time: 0 white, 1 pink, 2 red
+    goal_selection_strategy: Annotated[str, OneOf(*STRATEGIES)] = "none"  # HER: where replay finds other goals; for goal environments
+    n_sampled_goal: Annotated[int, AtLeast(1)] = 4  # k: transitions with another goal for each one with its own
     net_arch: tuple[int, ...] = (256, 256)  # widths of the hidden layers
     activation: Annotated[str, OneOf(*ACTIVATIONS)] = "relu"  # after each hidden layer
 

@@ -13,8 +13,10 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from thorndike.functional.coloured_noise import coloured_noise
 from thorndike.functional.guards import accept_if, all_finite
 from thorndike.functional.schedules import schedule
+from thorndike.replay.hindsight import Hindsight, replay_for
 from thorndike.replay.pace import pace
-from thorndike.replay.uniform import ReplayBuffer, Transitions, add, init_replay, row_shapes, sample
+from thorndike.replay.replay import Ring
+from thorndike.replay.uniform import Transitions, row_shapes
 from thorndike.types import Algorithm, EnvSpec, Metrics, Needs, Observation, Rollout
 
 
@@ -59,6 +61,14 @@ class Settings(Protocol):
         """Of the exploration noise over time: 0 white, 1 pink, 2 red."""
 
     @property
+    def goal_selection_strategy(self) -> str:
+        """Where replay finds other goals: see ``hindsight.py``."""
+
+    @property
+    def n_sampled_goal(self) -> int:
+        """Transitions with another goal for each one with its own."""
+
+    @property
     def net_arch(self) -> tuple[int, ...]:
         """Widths of the hidden layers."""
 
@@ -92,7 +102,7 @@ class State(NamedTuple):
 
     learnt: PyTree
     updates: Int[Array, ""]
-    replay: ReplayBuffer
+    replay: PyTree
     env_steps: Int[Array, ""]
 
 
@@ -128,10 +138,14 @@ def off_policy(method: Method, config: Settings, spec: EnvSpec) -> Algorithm:
     plan = pace(method.name, *sizes, spec.num_envs)
     per_iteration = plan.rollout_length * spec.num_envs
     learning_rate = schedule(config.learning_rate)
+    ring, hindsight = (
+        Ring(row_shapes(spec), plan.ring_steps, spec.num_envs),
+        Hindsight(config.goal_selection_strategy, config.n_sampled_goal),
+    )
+    memory = replay_for(ring, config.batch_size, config.gamma, hindsight, spec)
 
     def init(key: Key[Array, ""]) -> State:
-        replay = init_replay(row_shapes(spec), plan.ring_steps, spec.num_envs)
-        return State(method.init(key), jnp.zeros((), jnp.int32), replay, jnp.zeros((), jnp.int32))
+        return State(method.init(key), jnp.zeros((), jnp.int32), memory.init(), jnp.zeros((), jnp.int32))
 
     def actor(state: State) -> Actor:
         return Actor(method.acting(state.learnt), state.env_steps < config.learning_starts)
@@ -142,18 +156,18 @@ def off_policy(method: Method, config: Settings, spec: EnvSpec) -> Algorithm:
         return memory, jnp.where(actor.at_random, uniform, method.explore(actor.learnt, obs, noise)), {}
 
     def observe(state: State, rollout: Rollout, key: Key[Array, ""]) -> tuple[State, Metrics]:
-        return state._replace(replay=add(state.replay, rollout), env_steps=state.env_steps + per_iteration), {}
+        return state._replace(replay=memory.add(state.replay, rollout), env_steps=state.env_steps + per_iteration), {}
 
     def update(state: State, rollout: Rollout, key: Key[Array, ""]) -> tuple[State, Metrics]:
         rate = learning_rate(state.env_steps / config.total_steps)
-        replay = add(state.replay, rollout)
+        replay = memory.add(state.replay, rollout)
         # One key more than updates: from a single one the compiler would take the sampling out of the loop (see ``repeated``).
         keys = jax.random.split(key, plan.gradient_steps + 1)
         drawn = method.draw(keys[-1], plan.gradient_steps)
 
         def one(learnt: PyTree, i: Int[Array, ""]) -> tuple[PyTree, Metrics]:
             noise = jax.tree.map(lambda x: x[i], drawn)
-            batch = sample(replay, keys[i], config.batch_size, spec.num_envs, 1, config.gamma)
+            batch = memory.sample(replay, keys[i], jnp.ones(())).batch
             after, metrics = method.learn(learnt, batch, noise, rate, state.updates + i)
             return accept_if(all_finite(*metrics.values()), after, learnt), metrics
 
