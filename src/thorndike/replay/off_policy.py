@@ -87,7 +87,7 @@ class Method(NamedTuple):
     """key -> all that is learnt. Consumes the key."""
     acting: Callable[[PyTree], PyTree]
     """The learnt -> the part that acting and valuing need."""
-    explore: Callable[[PyTree, Observation, Float[Array, "M D"]], Float[Array, "M D"]]
+    explore: Callable[[PyTree, Observation, Float[Array, "M D"] | Float[Array, "M H D"]], Float[Array, "M D"]]
     """acting part, obs, standard normal noise -> action while learning."""
     greedy: Callable[[PyTree, Observation], Float[Array, "M D"]]
     value: Callable[[PyTree, Observation], Float[Array, " M"]]
@@ -95,6 +95,8 @@ class Method(NamedTuple):
     """key, number of updates -> their random numbers, leading with the update. Consumes the key."""
     learn: Callable[[PyTree, Transitions, PyTree, Float[Array, ""], Int[Array, ""]], tuple[PyTree, Metrics]]
     """The learnt, a minibatch, random numbers of this update, learning rate, number of the update -> the learnt, metrics."""
+    features: int = 0
+    """H: above 0, exploration depends on the state; its noise is ``[M, H, D]`` and comes as ``HeldNoise``."""
 
 
 class State(NamedTuple):
@@ -138,10 +140,9 @@ def off_policy(method: Method, config: Settings, spec: EnvSpec) -> Algorithm:
     plan = pace(method.name, *sizes, spec.num_envs)
     per_iteration = plan.rollout_length * spec.num_envs
     learning_rate = schedule(config.learning_rate)
-    ring, hindsight = (
-        Ring(row_shapes(spec), plan.ring_steps, spec.num_envs),
-        Hindsight(config.goal_selection_strategy, config.n_sampled_goal),
-    )
+    ring = Ring(row_shapes(spec), plan.ring_steps, spec.num_envs)
+    hindsight = Hindsight(config.goal_selection_strategy, config.n_sampled_goal)
+    noise_shape = (spec.num_envs, *((method.features,) if method.features else ()), method.dimensions)
     memory = replay_for(ring, config.batch_size, config.gamma, hindsight, spec)
 
     def init(key: Key[Array, ""]) -> State:
@@ -150,10 +151,11 @@ def off_policy(method: Method, config: Settings, spec: EnvSpec) -> Algorithm:
     def actor(state: State) -> Actor:
         return Actor(method.acting(state.learnt), state.env_steps < config.learning_starts)
 
-    def act(actor: Actor, memory: PyTree, obs: Observation, noise: Float[Array, "B D"]) -> tuple[PyTree, Float[Array, "B D"], PyTree]:
+    def act(actor: Actor, memory: PyTree, obs: Observation, noise: PyTree) -> tuple[PyTree, Float[Array, "B D"], PyTree]:
+        smooth, white = (noise.held, noise.fresh[..., 0, :]) if method.features else (noise, noise)
         # The distribution function of the normal makes its noise uniform: no second draw.
-        uniform = jax.scipy.special.erf(noise * 0.5**0.5)
-        return memory, jnp.where(actor.at_random, uniform, method.explore(actor.learnt, obs, noise)), {}
+        uniform = jax.scipy.special.erf(white * 0.5**0.5)
+        return memory, jnp.where(actor.at_random, uniform, method.explore(actor.learnt, obs, smooth)), {}
 
     def observe(state: State, rollout: Rollout, key: Key[Array, ""]) -> tuple[State, Metrics]:
         return state._replace(replay=memory.add(state.replay, rollout), env_steps=state.env_steps + per_iteration), {}
@@ -179,7 +181,7 @@ def off_policy(method: Method, config: Settings, spec: EnvSpec) -> Algorithm:
         init=init,
         actor=actor,
         memory=lambda batch: (),
-        draw=lambda key, steps: coloured_noise(key, steps, (spec.num_envs, method.dimensions), config.noise_color),
+        draw=lambda key, steps: coloured_noise(key, steps, noise_shape, config.noise_color),
         act=act,
         greedy=lambda actor, memory, obs, noise: (memory, method.greedy(actor.learnt, obs), {}),
         value=lambda actor, obs: method.value(actor.learnt, obs),
