@@ -95,7 +95,7 @@ def add_hindsight(replay: HindsightReplay, rollout: Rollout) -> HindsightReplay:
     # The first step of each row's episode: the latest beginning before it.
     begins = jax.lax.cummax(jnp.concatenate([replay.under_way[None], fresh]), axis=0)
     began = jax.lax.dynamic_update_slice_in_dim(replay.began, begins[:-1].ravel(), replay.ring.position * num_envs, axis=0)
-    first_rows = (begins[:-1] % steps) * num_envs + jnp.arange(num_envs, dtype=jnp.int32)
+    first_rows = (begins[:-1] % steps) * num_envs + jnp.arange(num_envs, dtype=jnp.int32)[None]
     # The largest: later steps of this rollout, and all of them over those of an episode that the ring has forgotten.
     ends = jnp.broadcast_to(number[:, None], begins[:-1].shape).ravel()
     last = replay.last.at[first_rows.ravel()].max(ends, mode="promise_in_bounds")
