@@ -222,7 +222,7 @@ SLOW_CASES = {
     ),
     "redq": lambda: learn(BOX, partial(control_for, 1200, redq, gradient_steps=4, policy_delay=2, n_critics=4), 1200),
     "ppo, Box, squashed": lambda: learn(BOX, partial(ppo_for, 60, log_std_init=-2.0, action_distribution="squashed"), 60),
-    "ppo, Box, beta": lambda: learn(BOX, partial(ppo_for, 150, action_distribution="beta"), 150),
+    "ppo, Box, beta": lambda: learn(BOX, partial(ppo_for, 400, action_distribution="beta", learning_rate="linear(0.004, 0)"), 400),
     "ppo, Box, held noise": lambda: learn(BOX, partial(ppo_for, 60, log_std_init=-2.0, use_sde=True, sde_sample_freq=4), 60),
     "a2c, Box, held noise": lambda: learn(BOX, partial(a2c_for, 600, log_std_init=-2.0, use_sde=True, sde_sample_freq=4), 600),
     "sac, held noise": lambda: learn(BOX, partial(control_for, 1200, sac, use_sde=True, sde_sample_freq=4), 1200, noisy=True),

@@ -8,7 +8,14 @@ from scipy import stats
 
 from thorndike.errors import UserError
 from thorndike.functional.action_distributions import state_dependent_gaussian
-from thorndike.functional.held_noise import HeldNoise, state_dependent_parameters, state_dependent_sample, with_held_noise
+from thorndike.functional.held_noise import (
+    HeldNoise,
+    noise_features,
+    state_dependent_parameters,
+    state_dependent_sample,
+    with_constant,
+    with_held_noise,
+)
 from thorndike.types import Algorithm, Needs, Rollout
 
 ROWS, FEATURES, DIMENSIONS = 5, 4, 3
@@ -45,6 +52,13 @@ def test_the_density_is_that_of_actions_over_all_noise_matrices():
     np.testing.assert_allclose(distribution.log_prob(parameters[0], MEAN[1]), expected.logpdf(MEAN[1]).sum(), rtol=1e-4)
     np.testing.assert_allclose(distribution.entropy(parameters[0]), expected.entropy().sum(), rtol=1e-4)
     np.testing.assert_array_equal(distribution.mode(parameters), MEAN)
+
+
+def test_there_is_noise_where_all_features_are_zero():
+    features = with_constant(jnp.zeros((2, 3)))
+    assert features.shape == (2, noise_features(3))
+    parameters = state_dependent_parameters(jnp.zeros((2, 1)), features, jnp.full((4, 1), -1.0))
+    np.testing.assert_allclose(parameters[:, 1], -1.0, atol=1e-5)
 
 
 def recording(length: int) -> Algorithm:

@@ -24,7 +24,7 @@ from jaxtyping import Array, Float, Key
 from thorndike.errors import UserError
 from thorndike.functional.critic_losses import chosen_critics, lowest, squared_errors
 from thorndike.functional.descent import Optimized, descend, every, follow, optimized
-from thorndike.functional.held_noise import state_dependent_sample, with_held_noise
+from thorndike.functional.held_noise import noise_features, state_dependent_sample, with_held_noise
 from thorndike.functional.soft_policy import SoftPolicy, Temperature, improve_policy, soft_policy, temperature
 from thorndike.functional.squashed_gaussian import sample_squashed, squashed_mode
 from thorndike.networks.continuous import StateDependent, box_dimensions, critics, policy_outputs, state_dependent
@@ -184,7 +184,7 @@ def soft_actor_critic(name: str, config: Settings, parts: Parts, spec: EnvSpec, 
         value=lambda acting, obs: parts.objective(net.apply(acting.critics, obs, greedy(acting, obs))),
         draw=draw,
         learn=learn,
-        features=0 if smooth is None else config.net_arch[-1],
+        features=0 if smooth is None else noise_features(config.net_arch[-1]),
     )
     return off_policy(method, config, spec) if smooth is None else with_held_noise(off_policy(method, config, spec), smooth.sample_freq)
 

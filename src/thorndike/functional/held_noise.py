@@ -4,6 +4,9 @@ Raffin, Kober, Stulp 2020, "Smooth Exploration for Robotic Reinforcement Learnin
 ``features(s) @ (deviations * E)`` with ``E`` a matrix ``[H, D]`` of standard normal numbers that stays for ``sde_sample_freq`` steps: the
 same state meets the same noise. Over all matrices an action is Gaussian (paper, eq. 5), which is what is learnt from.
 
+One deviation: a constant is among the features. Without it there is no noise where all others are 0, as in a new network that sees zeros,
+and the density of an action without noise has gradients without bounds.
+
 The held matrix is part of the learner's memory: it is saved with a run, and begins anew with an episode.
 """
 
@@ -17,7 +20,17 @@ from thorndike.errors import UserError
 from thorndike.types import Algorithm, Metrics, Observation, Rollout
 
 SMALLEST_VARIANCE = 1e-6
-"""Added to a state's variance, which is 0 where no feature is active."""
+"""Added to a state's variance, against rounding where deviations have shrunk."""
+
+
+def noise_features(width: int) -> int:
+    """How many features H the noise depends on, of a last hidden layer of this width."""
+    return width + 1
+
+
+def with_constant(features: Float[Array, "*B W"]) -> Float[Array, "*B H"]:
+    """The features, and a 1."""
+    return jnp.concatenate([features, jnp.ones_like(features[..., :1])], axis=-1)
 
 
 class HeldNoise(NamedTuple):

@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Key
 
 from thorndike.errors import UserError
-from thorndike.functional.held_noise import state_dependent_parameters
+from thorndike.functional.held_noise import noise_features, state_dependent_parameters, with_constant
 from thorndike.networks.masking import observed, without_mask
 from thorndike.networks.network import Network, NetworkBuilder, flattened
 from thorndike.networks.torso import ACTIVATIONS, Torso, example_observation, flatten_observation, is_image, torch_uniform
@@ -36,8 +36,8 @@ class PolicyOutputs(nn.Module):
         outputs = nn.Dense(self.outputs, kernel_init=torch_uniform, name="policy")(features)
         if not self.state_dependent:
             return outputs
-        log_std = self.param("log_std", nn.initializers.constant(self.log_std_init), (features.shape[-1], self.outputs))
-        return state_dependent_parameters(outputs, features, log_std)
+        log_std = self.param("log_std", nn.initializers.constant(self.log_std_init), (noise_features(features.shape[-1]), self.outputs))
+        return state_dependent_parameters(outputs, with_constant(features), log_std)
 
 
 class ActionValue(nn.Module):

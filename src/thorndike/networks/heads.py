@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from thorndike.errors import UserError
 from thorndike.functional.action_distributions import ActionDistribution, action_distribution
-from thorndike.functional.held_noise import state_dependent_parameters
+from thorndike.functional.held_noise import noise_features, state_dependent_parameters, with_constant
 from thorndike.networks.masking import masked
 from thorndike.networks.network import Network, NetworkBuilder
 from thorndike.networks.recurrent import Remembering, remembering, side_by_side
@@ -67,8 +67,8 @@ def policy_parameters(module: ActorCritic | PolicyHead, features: Float[Array, "
     parameters = nn.Dense(module.outputs, kernel_init=nn.initializers.orthogonal(0.01), name="policy")(features)
     start = nn.initializers.constant(module.log_std_init)
     if module.state_dependent:
-        log_std = module.param("log_std", start, (features.shape[-1], module.outputs))
-        return state_dependent_parameters(parameters, jax.lax.stop_gradient(features), log_std)
+        log_std = module.param("log_std", start, (noise_features(features.shape[-1]), module.outputs))
+        return state_dependent_parameters(parameters, with_constant(jax.lax.stop_gradient(features)), log_std)
     if not module.free_parameters:
         return parameters
     log_std = module.param("log_std", start, (module.free_parameters,))
@@ -221,7 +221,7 @@ def stochastic_policy(
     if use_sde and shape.memory == "none" and not shape.net_arch:
         raise UserError("use_sde explores by the features of the last hidden layer: net_arch needs one")
     width = shape.net_arch[-1] if shape.memory == "none" and shape.net_arch else shape.memory_size
-    distribution = action_distribution(spec.action_space, kind, width if use_sde else 0)
+    distribution = action_distribution(spec.action_space, kind, noise_features(width) if use_sde else 0)
     return distribution, policy_network(spec, distribution, shape, log_std_init, given)
 
 

@@ -10,6 +10,7 @@ judged differently, because goals are float32.
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import TypeAlias
 
 import gymnasium
@@ -86,10 +87,14 @@ def _found(theirs: Callable, candidates: Sequence[Judge], goals: tuple[np.ndarra
     if answers is None or answers.shape != (len(achieved),):
         return None
     for candidate in candidates:
-        said = _answers(lambda candidate=candidate: np.asarray(jax.jit(candidate)(achieved, desired), np.float64))
+        said = _answers(partial(_said, candidate, achieved, desired))
         if said is not None and said.shape == answers.shape and np.allclose(said, answers, rtol=1e-3, atol=1e-4):
             return candidate
     return None
+
+
+def _said(candidate: Judge, achieved: np.ndarray, desired: np.ndarray) -> np.ndarray:
+    return np.asarray(jax.jit(candidate)(achieved, desired), np.float64)
 
 
 def _answers(ask: Callable[[], np.ndarray]) -> np.ndarray | None:
