@@ -1,5 +1,6 @@
 """Hindsight against a slow loop over everything that was stored: which goals are drawn, and what they are worth."""
 
+import re
 from collections import Counter
 from functools import partial
 
@@ -9,10 +10,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from thorndike.algorithms import dqn
+from thorndike.environments import wrappers
+from thorndike.environments.native import factory
+from thorndike.environments.native.vectorize import vectorize
 from thorndike.errors import UserError
 from thorndike.replay.hindsight import Hindsight, add_hindsight, goal_of, init_hindsight, replay_for, sample_hindsight, with_goals
 from thorndike.replay.replay import Ring
 from thorndike.replay.uniform import Transitions, row_shapes
+from thorndike.training import runner as runner_module
+from thorndike.training.sources import compiled_source
 from thorndike.types import EnvSpec, Goal, Rollout, Step
 
 STEPS, NUM_ENVS, GAMMA, DRAWS = 12, 3, 0.9, 6_000
@@ -138,3 +145,20 @@ def test_what_has_no_goals_is_refused_in_one_line():
             act()
         assert "\n" not in str(error.value)
     assert replay_for(ring, 4, GAMMA, Hindsight("none", 4), plain)
+
+
+def test_no_step_copies_the_ring_or_what_is_beside_it(monkeypatch):
+    size, programs, compile_segment = 12_347, [], runner_module.compile_segment
+    monkeypatch.setattr(runner_module, "compile_segment", lambda lowered: programs.append(compile_segment(lowered)) or programs[-1])
+    environment = vectorize(factory("BitFlip-v0")(bits=3), 1)
+    config = dqn.Config(
+        goal_selection_strategy="future", buffer_size=size, learning_starts=10, batch_size=8, train_freq=1, net_arch=(8,), total_steps=1000
+    )
+    algorithm = dqn.dqn(config, environment.spec)
+    bound = runner_module.runner(algorithm, compiled_source(environment, algorithm, wrappers.chain()), 0, range(1))
+    bound.advance(bound.init(), 0, algorithm.needs.warmup_iterations + 2)
+    assert len(programs) == 2
+    for program in programs:
+        assert f"[{size}]" in program.as_text(), "the ring is in the program by this size"
+        loops = program.as_text().partition("ENTRY")[0]
+        assert not re.findall(rf"= \w+\[{size}[,\]]\S* copy\(", loops)
