@@ -126,14 +126,15 @@ def test_a_space_without_a_distribution_is_refused_in_one_line(space):
 
 
 SHARP = jnp.array([[0.3, -1.2, 0.4, -0.7], [2.0, 0.0, -1.5, 1.0]])
-"""Two rows of two means and two log deviations, or of two pairs of shapes."""
+"""Two rows of two means and two log deviations, or of the logits of two modes and their log concentrations."""
 
 
 def box_reference(kind: str, row: int, column: int):
     """Density and distribution function of one number of an action, by scipy."""
     first, second = (float(SHARP[row, i]) for i in (column, 2 + column))
     if kind == "beta":
-        reference = stats.beta(1 + np.log1p(np.exp(first)), 1 + np.log1p(np.exp(second)), loc=-1, scale=2)
+        share, concentration = 1 / (1 + np.exp(-first)), np.exp(second)
+        reference = stats.beta(1 + concentration * share, 1 + concentration * (1 - share), loc=-1, scale=2)
         return reference.pdf, reference.cdf
     inner = stats.norm(first, np.exp(second))
     return lambda x: inner.pdf(np.arctanh(x)) / (1 - x**2), lambda x: inner.cdf(np.arctanh(np.clip(x, -1 + 1e-9, 1 - 1e-9)))

@@ -203,24 +203,21 @@ def squashed(base: ActionDistribution, dimensions: int) -> ActionDistribution:
 
 
 def beta(dimensions: int) -> ActionDistribution:
-    """Independent Beta distributions stretched over [-1, 1], with ``a = 1 + softplus(x)`` and ``b = 1 + softplus(y)`` of parameters x, y.
+    """Independent Beta distributions stretched over [-1, 1]; nothing falls outside the bounds, so nothing is clipped.
 
     Chou, Maturana, Scherer 2017, "Improving Stochastic Policy Gradients in Continuous Control with Deep Reinforcement Learning using the
-    Beta Distribution" (ICML). Both above 1, so that there is one mode. No noise falls outside the bounds, so nothing is clipped.
+    Beta Distribution" (ICML): ``a`` and ``b`` above 1, so that there is one mode. Deviation: parameters are the mode's logit m and the
+    logarithm k of the concentration, ``a = 1 + e^k sigmoid(m)`` and ``b = 1 + e^k sigmoid(-m)``. By ``1 + softplus`` of one number each,
+    as in the paper, an ``a`` that falls to 1 has no gradient any more and stays there: a probe environment caught it.
     """
 
     def shapes(parameters: Float[Array, "*B P"]) -> tuple[Float[Array, "*B D"], Float[Array, "*B D"]]:
-        above = jax.nn.softplus(parameters)
-        return 1.0 + above[..., :dimensions], 1.0 + above[..., dimensions:]
+        logit, concentration = parameters[..., :dimensions], jnp.exp(jnp.clip(parameters[..., dimensions:], -10.0, 10.0))
+        return 1.0 + concentration * jax.nn.sigmoid(logit), 1.0 + concentration * jax.nn.sigmoid(-logit)
 
     def sample(parameters: Float[Array, "*B P"], noise: Float[Array, "*B D 2 tries 2"]) -> Float[Array, "*B D"]:
         pair = _gamma(jnp.stack(shapes(parameters), axis=-1), noise)
         return 2.0 * pair[..., 0] / (pair[..., 0] + pair[..., 1]) - 1.0
-
-    def mode(parameters: Float[Array, "*B P"]) -> Float[Array, "*B D"]:
-        a, b = shapes(parameters)
-        # Without the smallest number, 0 / 0 where both are 1: the uniform distribution.
-        return (a - b) / (a + b - 2.0 + 1e-8)
 
     def log_prob(parameters: Float[Array, "*B P"], action: Float[Array, "*B D"]) -> Float[Array, "*B"]:
         a, b = shapes(parameters)
@@ -239,7 +236,7 @@ def beta(dimensions: int) -> ActionDistribution:
         free_parameters=0,
         draw=lambda key, shape: jax.random.normal(key, (*shape, dimensions, 2, _TRIES, 2)),
         sample=sample,
-        mode=mode,
+        mode=lambda parameters: jnp.tanh(0.5 * parameters[..., :dimensions]),
         log_prob=log_prob,
         entropy=entropy,
     )
