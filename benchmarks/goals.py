@@ -48,8 +48,8 @@ class Case(NamedTuple):
 
 
 CASES = (
-    Case("DQN", "bits", "dqn", "BitFlip-v0", {"bits": 25}, BITS, 100_000, 3),
-    Case("DQN + HER", "bits", "dqn", "BitFlip-v0", {"bits": 25}, BITS | {"goal_selection_strategy": "future"}, 100_000, 3),
+    Case("DQN", "bits", "dqn", "BitFlip-v0", {"bits": 25}, BITS, 100_000, 2),
+    Case("DQN + HER", "bits", "dqn", "BitFlip-v0", {"bits": 25}, BITS | {"goal_selection_strategy": "future"}, 100_000, 2),
     Case("SAC + HER", "fetch", "sac", "FetchReach-v4", {}, FETCH | {"goal_selection_strategy": "future"}, 20_000, 3),
 )
 
@@ -73,7 +73,7 @@ def measure(case: Case, steps: int | None) -> dict:
 
 def _bits(policy: td.LoadedPolicy) -> list[float]:
     """Only the goal terminates an episode."""
-    # Few environments: each compiled one of the reference kind compiles itself.
+    # Few environments, because each of the reference kind compiles itself.
     rows = policy.evaluate(EPISODES, seed=0, num_envs=2).rows
     return [float(np.mean([row.terminated for row in rows if row.seed == seed])) for seed in range(len(policy.seeds))]
 
