@@ -27,7 +27,7 @@ class NativeEnv(gymnasium.Env):
             state, step = environment.step(state, actions, first(environment.draw(jax.random.key(seed), 1)))
             return state, first((step.next_obs, step.reward, step.terminated, step.truncated))
 
-        # One program a call: what is left in Python between them would take ten times as long.
+        # One program a call, not many small ones with Python between them.
         self._start, self._move = jax.jit(start), jax.jit(move)
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[object, dict]:
