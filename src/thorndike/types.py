@@ -85,6 +85,14 @@ class EpisodeStats(NamedTuple):
     """Valid environment steps in the rollout."""
 
 
+class Goal(NamedTuple):
+    """How a goal environment judges, as pure functions of goals ``[M, ...]``: achieved, desired -> ``[M]``."""
+
+    reward: Callable[[PyTree, PyTree], Float[Array, "*batch"]]
+    terminated: Callable[[PyTree, PyTree], Bool[Array, "*batch"]]
+    """Whether reaching ends the episode."""
+
+
 class EnvSpec(NamedTuple):
     """Facts about an environment."""
 
@@ -98,6 +106,8 @@ class EnvSpec(NamedTuple):
     num_agents: int = 1
     can_vmap: bool = True
     can_restore: bool = True
+    goal: Goal | None = None
+    """For hindsight; None where there are no goals, or where no compiled program can judge them."""
 
 
 class Environment(NamedTuple):

@@ -89,6 +89,10 @@ RUN = {
     "impala": Case(impala.impala, impala.Config(total_steps=1000, n_steps=5, net_arch=(8,), policy_lag=2), "CartPole-v1", NORMALISED),
     "trpo": Case(trpo.trpo, TRPO, "CartPole-v1"),
     "a3c, gru": Case(a3c.a3c, a3c.Config(net_arch=(8,), memory="gru", memory_size=8), "CartPole-v1"),
+    "a2c, held noise": Case(
+        a2c.a2c, a2c.Config(net_arch=(8,), use_sde=True, sde_sample_freq=3, action_distribution="squashed"), "Pendulum-v1"
+    ),
+    "dqn, hindsight": Case(dqn.dqn, parts(DQN, goal_selection_strategy="future"), "BitFlip-v0"),
     "ppo": Case(ppo.ppo, PPO, "CartPole-v1", NORMALISED),
     "dqn": Case(dqn.dqn, parts(DQN, double=True, dueling=True, n_step=3), "CartPole-v1"),
     "rainbow": Case(rainbow.rainbow, rainbow.Config(**OF_THE_FAMILY, atoms=11), "CartPole-v1"),
@@ -100,6 +104,9 @@ RUN = {
 ALL = RUN | {
     "sac, one update a step": Case(sac.sac, sac.Config(**CONTROL | {"train_freq": 4, "gradient_steps": 1}), "Pendulum-v1", NORMALISED),
     "sac, fixed temperature": Case(sac.sac, sac.Config(**CONTROL, ent_coef=0.1, layer_norm=True), "MountainCarContinuous-v0"),
+    "sac, held noise": Case(sac.sac, sac.Config(**CONTROL, use_sde=True), "Pendulum-v1"),
+    "ppo, Box, held noise, gru": Case(ppo.ppo, parts(PPO, use_sde=True, memory="gru", memory_size=8), "Pendulum-v1"),
+    "ppo, Box, beta": Case(ppo.ppo, parts(PPO, action_distribution="beta"), "Pendulum-v1"),
     "ddpg": Case(ddpg.ddpg, ddpg.Config(**CONTROL), "Pendulum-v1"),
     "tqc": Case(tqc.tqc, tqc.Config(**CONTROL, n_quantiles=5), "Pendulum-v1"),
     "redq": Case(redq.redq, redq.Config(**CONTROL | {"gradient_steps": 4}, policy_delay=4), "Pendulum-v1"),
@@ -187,7 +194,7 @@ class Bound(NamedTuple):
     traces: list[str]
 
 
-SLOW = ("ppo, bonuses", "td3", "crossq", "dqn, lstm", "a2c, gru", "a3c, gru", "trpo", "pqn")
+SLOW = ("ppo, bonuses", "dqn, hindsight", "td3", "crossq", "dqn, lstm", "a2c, gru", "a3c, gru", "trpo", "pqn")
 """Cases whose machinery another one runs too."""
 
 

@@ -101,7 +101,7 @@ class Learnt(NamedTuple):
         def chosen(actor, seen):
             noise = jax.tree.map(lambda leaf: leaf[:, : seen.shape[0]], self.algorithm.draw(jax.random.key(7), SAMPLES))
             choose = self.algorithm.greedy if hasattr(actor, "epsilon") else self.algorithm.act
-            return jax.vmap(lambda drawn: choose(actor, (), seen, drawn)[1])(noise)
+            return jax.vmap(lambda drawn: choose(actor, self.algorithm.memory(seen.shape[0]), seen, drawn)[1])(noise)
 
         return np.asarray(self._of_each_seed(number, chosen))
 
@@ -274,6 +274,10 @@ SLOW_CASES = {
         BOX, partial(control_for, 1000, crossq, critic_net_arch=(32,), renorm_warmup=100, batch_size=64, ent_coef_init=0.1), 1000
     ),
     "redq": lambda: learn(BOX, partial(control_for, 1200, redq, gradient_steps=4, policy_delay=2, n_critics=4), 1200),
+    "ppo, Box, squashed": lambda: learn(BOX, partial(ppo_for, 60, log_std_init=-2.0, action_distribution="squashed"), 60),
+    "ppo, Box, beta": lambda: learn(BOX, partial(ppo_for, 80, action_distribution="beta"), 80),
+    "ppo, Box, held noise": lambda: learn(BOX, partial(ppo_for, 60, log_std_init=-2.0, use_sde=True, sde_sample_freq=4), 60),
+    "sac, held noise": lambda: learn(BOX, partial(control_for, 1200, sac, use_sde=True, sde_sample_freq=4), 1200, noisy=True),
     "a2c, Box": lambda: learn(BOX, partial(a2c_for, 600, log_std_init=-2.0), 600),
     "a3c": lambda: learn(DISCRETE, partial(a3c_for, 600), 600),
     "a3c, Box": lambda: learn(BOX, partial(a3c_for, 800, log_std_init=-2.0, learning_rate="linear(0.003, 0)"), 800),

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from thorndike.environments.native import NATIVE, factory
+from thorndike.environments.native import NATIVE, factory, is_only_native
 from thorndike.environments.native.randomness import uniforms
 from thorndike.environments.native.table import read_table, table_dynamics
 from thorndike.environments.native.vectorize import Dynamics, vectorize
@@ -101,10 +101,12 @@ def test_types_are_strong_and_stable(id: str) -> None:
 
 
 def _parts(space: gymnasium.Space) -> list[gymnasium.Space]:
+    if isinstance(space, gymnasium.spaces.Dict):
+        return [space[name] for name in sorted(space.spaces)]
     return list(space) if isinstance(space, gymnasium.spaces.Tuple) else [space]
 
 
-@pytest.mark.parametrize("id", [id for id in NATIVE if not id.startswith("probe/")])
+@pytest.mark.parametrize("id", [id for id in NATIVE if not is_only_native(id)])
 def test_spaces_and_limits_are_gymnasiums(id: str) -> None:
     dynamics, theirs = factory(id)(), make_single(id, {})
     assert dynamics.observation_space == theirs.observation_space

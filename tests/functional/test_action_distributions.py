@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import integrate, stats
 
 from thorndike.errors import UserError
 from thorndike.functional.action_distributions import action_distribution, categorical, diagonal_gaussian, multi_categorical
@@ -122,4 +122,75 @@ def test_each_space_has_its_distribution(space, outputs, free, shape):
 def test_a_space_without_a_distribution_is_refused_in_one_line(space):
     with pytest.raises(UserError, match="actions may be Discrete, MultiDiscrete") as error:
         action_distribution(space)
+    assert "\n" not in str(error.value)
+
+
+SHARP = jnp.array([[0.3, -1.2, 0.4, -0.7], [2.0, 0.0, -1.5, 1.0]])
+"""Two rows of two means and two log deviations, or of the logits of two modes and their log concentrations."""
+
+
+def box_reference(kind: str, row: int, column: int):
+    """Density and distribution function of one number of an action, by scipy."""
+    first, second = (float(SHARP[row, i]) for i in (column, 2 + column))
+    if kind == "beta":
+        share, concentration = 1 / (1 + np.exp(-first)), np.exp(second)
+        reference = stats.beta(1 + concentration * share, 1 + concentration * (1 - share), loc=-1, scale=2)
+        return reference.pdf, reference.cdf
+    inner = stats.norm(first, np.exp(second))
+    return lambda x: inner.pdf(np.arctanh(x)) / (1 - x**2), lambda x: inner.cdf(np.arctanh(np.clip(x, -1 + 1e-9, 1 - 1e-9)))
+
+
+@COMPILED
+@pytest.mark.parametrize("kind", ["squashed", "beta"])
+def test_a_bounded_distributions_density_and_entropy_are_those_of_integration(kind, compiled):
+    distribution = action_distribution(spaces.Box(-1, 1, (2,)), kind)
+    log_prob, entropy = (jax.jit(f) if compiled else f for f in (distribution.log_prob, distribution.entropy))
+    pairs = np.array(list(itertools.product(np.linspace(-0.999, 0.999, 7), repeat=2)))
+    for row in range(2):
+        densities = [box_reference(kind, row, column)[0] for column in range(2)]
+        expected = np.log(densities[0](pairs[:, 0])) + np.log(densities[1](pairs[:, 1]))
+        found = log_prob(jnp.broadcast_to(SHARP[row], (len(pairs), 4)), jnp.asarray(pairs, jnp.float32))
+        np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-3)
+        parts = [integrate.quad(lambda x, p=p: -p(x) * np.log(max(p(x), 1e-300)), -1, 1, limit=200)[0] for p in densities]
+        np.testing.assert_allclose(entropy(SHARP)[row], sum(parts), atol=5e-3)
+
+
+@pytest.mark.parametrize("kind", ["squashed", "beta"])
+def test_a_bounded_distributions_samples_follow_its_density_and_never_leave_the_bounds(kind):
+    distribution = action_distribution(spaces.Box(-1, 1, (2,)), kind)
+    for row in range(2):
+        action = samples(distribution, SHARP[row], 10_000, seed=row)
+        assert np.abs(action).max() <= 1.0
+        for column in range(2):
+            assert stats.kstest(action[:, column].astype(float), box_reference(kind, row, column)[1]).statistic < 0.02
+
+
+@pytest.mark.parametrize("kind", ["squashed", "beta"])
+def test_gradients_at_the_bounds_and_far_parameters_are_finite(kind):
+    distribution = action_distribution(spaces.Box(-1, 1, (2,)), kind)
+    for scale in (0.0, 1.0, 30.0):
+        parameters = scale * jnp.array([1.0, -1.0, -0.1, 0.1])
+        for action in (jnp.array([1.0, -1.0]), distribution.mode(parameters)):
+            slopes = jax.grad(lambda p, action=action: distribution.log_prob(p, action) + distribution.entropy(p))(parameters)
+            assert np.isfinite(slopes).all(), (scale, action)
+
+
+def test_a_betas_mode_is_where_its_density_is_highest():
+    distribution, grid = action_distribution(spaces.Box(-1, 1, (2,)), "beta"), np.linspace(-0.999, 0.999, 2001)
+    for row, column in itertools.product(range(2), range(2)):
+        highest = grid[np.argmax(box_reference("beta", row, column)[0](grid))]
+        np.testing.assert_allclose(distribution.mode(SHARP[row])[column], highest, atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("space", "kind", "features", "said"),
+    [
+        (spaces.Discrete(2), "beta", 0, "action_distribution=beta is for Box actions"),
+        (spaces.Discrete(2), "gaussian", 8, "use_sde is for Box actions"),
+        (spaces.Box(-1, 1, (2,)), "beta", 8, "use_sde explores with Gaussian noise"),
+    ],
+)
+def test_a_kind_that_a_space_cannot_have_is_refused_in_one_line(space, kind, features, said):
+    with pytest.raises(UserError, match=said) as error:
+        action_distribution(space, kind, features)
     assert "\n" not in str(error.value)

@@ -6,7 +6,8 @@ Mnih et al. 2016, "Asynchronous Methods for Deep Reinforcement Learning" (arXiv:
 2. Policy and value have separate networks (one shared torso on images, and with memory), weights orthogonal, as in OpenAI's A2C.
 3. Advantages are generalised (Schulman et al. 2016, arXiv:1506.02438); ``gae_lambda = 1``, the default, is the paper's n-step return.
 4. A step cut by a time limit bootstraps from the observation it was cut at, not from the next episode's first one.
-5. Box actions are chosen in [-1, 1] and mapped to the bounds; what lies outside is clipped by the environment's source.
+5. Box actions are chosen in [-1, 1] and mapped to the bounds; what lies outside is clipped by the environment's source, unless
+   ``action_distribution`` is ``squashed`` or ``beta``. With ``use_sde`` noise is held (Raffin et al. 2020, arXiv:2005.05719).
 
 Logs ``train/loss``, ``policy_loss``, ``value_loss``, ``entropy_loss``, ``explained_variance``, ``grad_norm``, ``learning_rate``. Results
 and their commands: docs/algorithms/a2c.md.
@@ -21,12 +22,13 @@ import optax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int, Key, PyTree
 
-from thorndike.functional.action_distributions import ActionDistribution, action_distribution, saturation
+from thorndike.functional.action_distributions import BOX_KINDS, ActionDistribution, saturation
 from thorndike.functional.guards import accept_if, all_finite
+from thorndike.functional.held_noise import with_held_noise
 from thorndike.functional.policy_losses import actor_critic_loss, explained_variance, standardize
 from thorndike.functional.returns import generalized_advantage
 from thorndike.functional.schedules import schedule
-from thorndike.networks.heads import Shape, policy_network
+from thorndike.networks.heads import Shape, stochastic_policy
 from thorndike.networks.network import Network, NetworkBuilder, apply_rollout, apply_step, fresh_memory
 from thorndike.networks.recurrent import MEMORIES
 from thorndike.networks.torso import ACTIVATIONS, example_observation
@@ -50,7 +52,10 @@ class Config:
     normalize_advantage: bool = False  # standardise the rollout's advantages
     net_arch: tuple[int, ...] = (64, 64)  # widths of the hidden layers
     activation: Annotated[str, OneOf(*ACTIVATIONS)] = "tanh"  # after each hidden layer
-    log_std_init: float = 0.0  # log standard deviation at the start (Box actions)
+    action_distribution: Annotated[str, OneOf(*BOX_KINDS)] = "gaussian"  # of Box actions; gaussian: clipped to the bounds
+    log_std_init: float = 0.0  # log standard deviation at the start (Box actions; beta has none)
+    use_sde: bool = False  # gSDE: explore by noise that depends on the state, and is held
+    sde_sample_freq: Annotated[int, AtLeast(-1)] = -1  # steps it is held for; -1: n_steps
     memory: Annotated[str, OneOf(*MEMORIES)] = "none"  # recurrent memory of the network
     memory_size: Annotated[int, AtLeast(1)] = 64  # its width
 
@@ -95,9 +100,8 @@ def a2c_loss(
 
 def a2c(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) -> Algorithm:
     """A2C for an environment. Raises ``UserError`` where the action space is not supported."""
-    distribution = action_distribution(spec.action_space)
     shape = Shape(config.net_arch, config.activation, config.memory, config.memory_size)
-    net = policy_network(spec, distribution, shape, config.log_std_init, network)
+    distribution, net = stochastic_policy(spec, shape, config.action_distribution, config.use_sde, config.log_std_init, network)
     optimizer = optax.chain(
         optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_rms(decay=0.99, eps=config.rms_prop_eps, eps_in_sqrt=False)
     )
@@ -127,7 +131,7 @@ def a2c(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) ->
         flat, opt_state = accept_if(accepted, (flat - rate * direction, opt_state), (flat, state.opt_state))
         return State(unravel(flat), opt_state, state.env_steps + config.n_steps * spec.num_envs), metrics
 
-    return Algorithm(
+    algorithm = Algorithm(
         init=init,
         actor=lambda state: state.params,
         memory=lambda batch: fresh_memory(net, batch),
@@ -139,3 +143,4 @@ def a2c(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) ->
         observe=lambda state, rollout, key: (state, {}),
         needs=Needs(rollout_length=config.n_steps, on_policy=True),
     )
+    return with_held_noise(algorithm, config.sde_sample_freq) if config.use_sde else algorithm

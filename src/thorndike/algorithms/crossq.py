@@ -28,6 +28,7 @@ from thorndike.functional.squashed_gaussian import sample_squashed, squashed_mod
 from thorndike.networks.batch_renorm import RenormalizedNetwork, renormalized_network
 from thorndike.networks.continuous import box_dimensions
 from thorndike.networks.torso import ACTIVATIONS, example_observation, flatten_observation
+from thorndike.replay.hindsight import STRATEGIES
 from thorndike.replay.off_policy import Method, off_policy
 from thorndike.replay.uniform import Transitions
 from thorndike.settings import AtLeast, Between, OneOf, check
@@ -52,6 +53,8 @@ class Config:
     n_critics: Annotated[int, AtLeast(1)] = 2  # K: critics of the ensemble
     policy_delay: Annotated[int, AtLeast(1)] = 3  # updates of the critics for each one of the policy
     noise_color: Annotated[float, AtLeast(0)] = 0.0  # exploration noise over time: 0 white, 1 pink, 2 red
+    goal_selection_strategy: Annotated[str, OneOf(*STRATEGIES)] = "none"  # HER: where replay finds other goals; for goal environments
+    n_sampled_goal: Annotated[int, AtLeast(1)] = 4  # k: transitions with another goal for each one with its own
     renorm_warmup: Annotated[int, AtLeast(0)] = 100_000  # updates before batch normalisation becomes renormalisation
     net_arch: tuple[int, ...] = (256, 256)  # widths of the policy's hidden layers
     critic_net_arch: tuple[int, ...] = (2048, 2048)  # widths of the critics' hidden layers

@@ -17,6 +17,7 @@ from typing import Annotated
 from thorndike.algorithms.td3 import Parts, deterministic_actor_critic
 from thorndike.networks.network import NetworkBuilder
 from thorndike.networks.torso import ACTIVATIONS
+from thorndike.replay.hindsight import STRATEGIES
 from thorndike.settings import AtLeast, Between, OneOf, check
 from thorndike.types import Algorithm, EnvSpec
 
@@ -36,6 +37,8 @@ class Config:
     gradient_steps: Annotated[int, AtLeast(-1)] = 1  # updates in a round; -1: one an environment step
     action_noise: Annotated[float, AtLeast(0)] = 0.1  # sigma: deviation of the exploration noise
     noise_color: Annotated[float, AtLeast(0)] = 0.0  # exploration noise over time: 0 white, 1 pink, 2 red
+    goal_selection_strategy: Annotated[str, OneOf(*STRATEGIES)] = "none"  # HER: where replay finds other goals; for goal environments
+    n_sampled_goal: Annotated[int, AtLeast(1)] = 4  # k: transitions with another goal for each one with its own
     net_arch: tuple[int, ...] = (256, 256)  # widths of the hidden layers
     activation: Annotated[str, OneOf(*ACTIVATIONS)] = "relu"  # after each hidden layer
 

@@ -4,7 +4,8 @@ Mnih et al. 2015, "Human-level control through deep reinforcement learning" (Nat
 arXiv:1509.06461), dueling (Wang et al. 2016, arXiv:1511.06581), n-step and all of Rainbow (Hessel et al. 2018, arXiv:1710.02298),
 prioritised replay (Schaul et al. 2016, arXiv:1511.05952), noisy layers (Fortunato et al. 2018, arXiv:1706.10295), distributions of
 returns (functional/distributional.py), Munchausen (Vieillard et al. 2020, arXiv:2007.14430), memory (Kapturowski et al. 2019, R2D2),
-periodic resets (Nikishin et al. 2022, arXiv:2205.07802), Boltzmann exploration (Sutton 1990). Deviations from Mnih:
+periodic resets (Nikishin et al. 2022, arXiv:2205.07802), Boltzmann exploration (Sutton 1990), hindsight (Andrychowicz et al. 2017,
+arXiv:1707.01495). Deviations from Mnih:
 
 1. Adam with gradients clipped by their global norm, in place of RMSProp (as in Stable-Baselines3).
 2. A step cut by a time limit bootstraps from the observation it was cut at.
@@ -27,6 +28,7 @@ from thorndike.networks.network import NetworkBuilder
 from thorndike.networks.recurrent import MEMORIES
 from thorndike.networks.torso import ACTIVATIONS
 from thorndike.replay.deep_q import Memory, Options, Priorities, deep_q
+from thorndike.replay.hindsight import STRATEGIES, Hindsight
 from thorndike.settings import AtLeast, Between, MoreThan, OneOf, check
 from thorndike.types import Algorithm, EnvSpec
 
@@ -69,6 +71,8 @@ class Config:
     munchausen_alpha: Annotated[float, Between(0, 1)] = 0.9  # alpha: how much of it
     munchausen_tau: Annotated[float, MoreThan(0)] = 0.03  # tau: temperature of the policy
     munchausen_clip: float = -1.0  # l_0: the log-policy's lowest value
+    goal_selection_strategy: Annotated[str, OneOf(*STRATEGIES)] = "none"  # HER: where replay finds other goals; for goal environments
+    n_sampled_goal: Annotated[int, AtLeast(1)] = 4  # k: transitions with another goal for each one with its own
     reset_every: Annotated[int, AtLeast(0)] = 0  # environment steps between new beginnings of the network; 0: never
     memory: Annotated[str, OneOf(*MEMORIES)] = "none"  # recurrent memory of the network
     memory_size: Annotated[int, AtLeast(1)] = 64  # its width
@@ -97,6 +101,7 @@ def dqn(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) ->
         noisy_sigma=config.noisy_sigma if config.noisy else None,
         munchausen=Munchausen(config.munchausen_alpha, config.munchausen_tau, config.munchausen_clip) if config.munchausen else None,
         memory=None if config.memory == "none" else Memory(config.memory, config.memory_size, config.sequence_length),
+        hindsight=None if config.goal_selection_strategy == "none" else Hindsight(config.goal_selection_strategy, config.n_sampled_goal),
         reset_every=config.reset_every,
         temperature=config.temperature if config.exploration == "boltzmann" else None,
     )

@@ -6,7 +6,8 @@ al. 2016 (arXiv:1506.02438). Deviations from the paper:
 1. Advantages are standardised in each minibatch, gradients clipped by their global norm, weights orthogonal, as in OpenAI's PPO2.
 2. Policy and value have separate networks (one shared torso on images, and with memory, whose minibatches are whole sequences).
 3. A step cut by a time limit bootstraps from the observation it was cut at, not from the next episode's first one.
-4. Box actions are chosen in [-1, 1] and mapped to the bounds; what lies outside is clipped by the environment's source, not squashed.
+4. Box actions are chosen in [-1, 1] and mapped to the bounds; what lies outside is clipped by the environment's source, unless
+   ``action_distribution`` is ``squashed`` or ``beta``. With ``use_sde`` noise is held (Raffin et al. 2020, arXiv:2005.05719).
 5. With ``target_kl`` the remaining minibatches of an iteration are skipped once the KL estimate passes 1.5 times the target.
 
 Logs ``train/loss``, ``policy_gradient_loss``, ``value_loss``, ``entropy_loss``, ``approx_kl``, ``clip_fraction``, ``explained_variance``,
@@ -23,9 +24,9 @@ import optax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from thorndike.errors import UserError
-from thorndike.functional.action_distributions import ActionDistribution, action_distribution, saturation
+from thorndike.functional.action_distributions import BOX_KINDS, ActionDistribution, saturation
 from thorndike.functional.guards import accept_if, all_finite
+from thorndike.functional.held_noise import with_held_noise
 from thorndike.functional.policy_losses import (
     approximate_kl,
     clip_fraction,
@@ -37,8 +38,8 @@ from thorndike.functional.policy_losses import (
 )
 from thorndike.functional.returns import generalized_advantage
 from thorndike.functional.schedules import schedule
-from thorndike.functional.shuffling import minibatches
-from thorndike.networks.heads import Shape, policy_network
+from thorndike.functional.shuffling import minibatch_size, minibatches
+from thorndike.networks.heads import Shape, stochastic_policy
 from thorndike.networks.network import Network, NetworkBuilder, apply_rollout, apply_step, as_rows, begins_episode, fresh_memory
 from thorndike.networks.recurrent import MEMORIES
 from thorndike.networks.torso import ACTIVATIONS, example_observation
@@ -66,7 +67,10 @@ class Config:
     normalize_advantage: bool = True  # standardise advantages in each minibatch
     net_arch: tuple[int, ...] = (64, 64)  # widths of the hidden layers
     activation: Annotated[str, OneOf(*ACTIVATIONS)] = "tanh"  # after each hidden layer
-    log_std_init: float = 0.0  # log standard deviation at the start (Box actions)
+    action_distribution: Annotated[str, OneOf(*BOX_KINDS)] = "gaussian"  # of Box actions; gaussian: clipped to the bounds
+    log_std_init: float = 0.0  # log standard deviation at the start (Box actions; beta has none)
+    use_sde: bool = False  # gSDE: explore by noise that depends on the state, and is held
+    sde_sample_freq: Annotated[int, AtLeast(-1)] = -1  # steps it is held for; -1: n_steps
     memory: Annotated[str, OneOf(*MEMORIES)] = "none"  # recurrent memory of the network
     memory_size: Annotated[int, AtLeast(1)] = 64  # its width
 
@@ -187,18 +191,10 @@ def improve(
 
 def ppo(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) -> Algorithm:
     """PPO for an environment. Raises ``UserError`` where a rollout does not divide into minibatches or the space is not supported."""
-    distribution = action_distribution(spec.action_space)
     shape = Shape(config.net_arch, config.activation, config.memory, config.memory_size)
-    net = policy_network(spec, distribution, shape, config.log_std_init, network)
+    distribution, net = stochastic_policy(spec, shape, config.action_distribution, config.use_sde, config.log_std_init, network)
     rows, sequences = config.n_steps * spec.num_envs, net.recurrence is not None
-    # With memory a minibatch is made of whole sequences, one an environment.
-    items, each = (spec.num_envs, config.n_steps) if sequences else (rows, 1)
-    per_minibatch = min(max(1, config.batch_size // each), items)
-    if items % per_minibatch:
-        raise UserError(
-            f"ppo: n_steps x environments = {config.n_steps} x {spec.num_envs} = {rows} rows do not divide into minibatches of "
-            f"batch_size {config.batch_size}; choose a batch_size that divides {rows}" + (f" and {each} divides" if sequences else "")
-        )
+    per_minibatch = minibatch_size("ppo", config.n_steps, spec.num_envs, config.batch_size, sequences)
     optimizer = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam(eps=1e-5))
     learning_rate, clip_range = schedule(config.learning_rate), schedule(config.clip_range)
     example = example_observation(spec.observation_space)
@@ -224,7 +220,7 @@ def ppo(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) ->
         flat, unravel = ravel_pytree(state.params)
         gradient = jax.value_and_grad(lambda v, rows: ppo_loss(unravel(v), rows, net, distribution, config, clip), has_aux=True)
 
-        order = minibatches(key, items, config.n_epochs, per_minibatch)
+        order = minibatches(key, spec.num_envs if sequences else rows, config.n_epochs, per_minibatch)
         flat, opt_state, going, metrics = improve(
             flat, state.opt_state, batch, order, gradient, optimizer, rate, config.target_kl, sequences
         )
@@ -235,7 +231,7 @@ def ppo(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) ->
             metrics["train/early_stop"] = 1.0 - going.astype(jnp.float32)
         return State(unravel(flat), opt_state, state.env_steps + rows), metrics
 
-    return Algorithm(
+    algorithm = Algorithm(
         init=init,
         actor=lambda state: state.params,
         memory=lambda batch: fresh_memory(net, batch),
@@ -247,3 +243,4 @@ def ppo(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) ->
         observe=lambda state, rollout, key: (state, {}),
         needs=Needs(rollout_length=config.n_steps, on_policy=True),
     )
+    return with_held_noise(algorithm, config.sde_sample_freq) if config.use_sde else algorithm

@@ -30,7 +30,7 @@ from thorndike.functional.guards import accept_if, all_finite
 from thorndike.functional.policy_losses import weighted_mean
 from thorndike.functional.returns import lambda_return
 from thorndike.functional.schedules import Rate, schedule
-from thorndike.functional.shuffling import minibatches
+from thorndike.functional.shuffling import minibatch_size, minibatches
 from thorndike.functional.temporal_difference import select
 from thorndike.networks.heads import Shape, q_network
 from thorndike.networks.masking import allowed, has_mask
@@ -128,12 +128,7 @@ def pqn(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) ->
     if not isinstance(spec.action_space, gymnasium.spaces.Discrete):
         raise UserError(f"pqn takes Discrete actions; {spec.id} has {spec.action_space}; ppo, a2c and reinforce take the others")
     rows = config.n_steps * spec.num_envs
-    per_minibatch = min(config.batch_size, rows)
-    if rows % per_minibatch:
-        raise UserError(
-            f"pqn: n_steps x environments = {config.n_steps} x {spec.num_envs} = {rows} rows do not divide into minibatches of "
-            f"batch_size {config.batch_size}; choose a batch_size that divides {rows}"
-        )
+    per_minibatch = minibatch_size("pqn", config.n_steps, spec.num_envs, config.batch_size)
     example = example_observation(spec.observation_space)
     shape = Shape(config.net_arch, config.activation, layer_norm=config.layer_norm)
     plain = q_network(spec, int(spec.action_space.n), shape, dueling=False, given=network)

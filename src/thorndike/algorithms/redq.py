@@ -16,8 +16,10 @@ from thorndike.algorithms.sac import Parts, soft_actor_critic
 from thorndike.errors import UserError
 from thorndike.functional.critic_losses import lowest, squared_errors
 from thorndike.functional.soft_policy import temperature
+from thorndike.networks.continuous import state_dependent
 from thorndike.networks.network import NetworkBuilder
 from thorndike.networks.torso import ACTIVATIONS
+from thorndike.replay.hindsight import STRATEGIES
 from thorndike.settings import AtLeast, Between, OneOf, check
 from thorndike.types import Algorithm, EnvSpec
 
@@ -43,6 +45,11 @@ class Config:
     policy_delay: Annotated[int, AtLeast(1)] = 20  # updates of the critics for each one of the policy
     layer_norm: bool = False  # normalise the critics' hidden layers
     noise_color: Annotated[float, AtLeast(0)] = 0.0  # exploration noise over time: 0 white, 1 pink, 2 red
+    use_sde: bool = False  # gSDE: explore by noise that depends on the state, and is held
+    sde_sample_freq: Annotated[int, AtLeast(-1)] = -1  # steps it is held for; -1: train_freq
+    log_std_init: float = -3.0  # with use_sde: log standard deviation of a feature's noise at the start
+    goal_selection_strategy: Annotated[str, OneOf(*STRATEGIES)] = "none"  # HER: where replay finds other goals; for goal environments
+    n_sampled_goal: Annotated[int, AtLeast(1)] = 4  # k: transitions with another goal for each one with its own
     net_arch: tuple[int, ...] = (256, 256)  # widths of the hidden layers
     activation: Annotated[str, OneOf(*ACTIVATIONS)] = "relu"  # after each hidden layer
 
@@ -55,6 +62,7 @@ class Config:
 def redq(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) -> Algorithm:
     """REDQ for an environment with Box actions. Raises ``UserError`` for other action spaces."""
     parts = Parts(
+        exploration=state_dependent(config.use_sde, config.sde_sample_freq, config.log_std_init, config.noise_color),
         heat=temperature(config.ent_coef, config.target_entropy, spec.action_space),
         ent_coef_init=config.ent_coef_init,
         tau=config.tau,

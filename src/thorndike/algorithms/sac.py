@@ -24,11 +24,13 @@ from jaxtyping import Array, Float, Key
 from thorndike.errors import UserError
 from thorndike.functional.critic_losses import chosen_critics, lowest, squared_errors
 from thorndike.functional.descent import Optimized, descend, every, follow, optimized
+from thorndike.functional.held_noise import noise_features, state_dependent_sample, with_held_noise
 from thorndike.functional.soft_policy import SoftPolicy, Temperature, improve_policy, soft_policy, temperature
 from thorndike.functional.squashed_gaussian import sample_squashed, squashed_mode
-from thorndike.networks.continuous import box_dimensions, critics, policy_outputs
+from thorndike.networks.continuous import StateDependent, box_dimensions, critics, policy_outputs, state_dependent
 from thorndike.networks.network import NetworkBuilder
 from thorndike.networks.torso import ACTIVATIONS
+from thorndike.replay.hindsight import STRATEGIES
 from thorndike.replay.off_policy import Method, Settings, off_policy
 from thorndike.replay.uniform import Transitions
 from thorndike.settings import AtLeast, Between, OneOf, check
@@ -57,6 +59,11 @@ class Config:
     policy_objective: Annotated[str, OneOf("min", "mean")] = "min"  # what the policy climbs: the critics' minimum or their mean
     layer_norm: bool = False  # normalise the critics' hidden layers
     noise_color: Annotated[float, AtLeast(0)] = 0.0  # exploration noise over time: 0 white, 1 pink, 2 red
+    use_sde: bool = False  # gSDE: explore by noise that depends on the state, and is held
+    sde_sample_freq: Annotated[int, AtLeast(-1)] = -1  # steps it is held for; -1: train_freq
+    log_std_init: float = -3.0  # with use_sde: log standard deviation of a feature's noise at the start
+    goal_selection_strategy: Annotated[str, OneOf(*STRATEGIES)] = "none"  # HER: where replay finds other goals; for goal environments
+    n_sampled_goal: Annotated[int, AtLeast(1)] = 4  # k: transitions with another goal for each one with its own
     net_arch: tuple[int, ...] = (256, 256)  # widths of the hidden layers
     activation: Annotated[str, OneOf(*ACTIVATIONS)] = "relu"  # after each hidden layer
 
@@ -94,6 +101,7 @@ class Drawn(NamedTuple):
 class Parts(NamedTuple):
     """What SAC and its relatives differ in."""
 
+    exploration: StateDependent | None
     heat: Temperature
     ent_coef_init: Number
     tau: Number
@@ -114,9 +122,19 @@ class Parts(NamedTuple):
 def soft_actor_critic(name: str, config: Settings, parts: Parts, spec: EnvSpec, network: NetworkBuilder | None) -> Algorithm:
     """A maximum-entropy learner from its parts. Raises ``UserError`` unless actions are a Box."""
     dimensions = box_dimensions(name, spec)
-    policy, init_policy = policy_outputs(spec, 2 * dimensions, config.net_arch, config.activation, network)
+    smooth = parts.exploration
+    outputs = 2 * dimensions if smooth is None else dimensions
+    policy, init_policy = policy_outputs(spec, outputs, config.net_arch, config.activation, network, smooth)
     net = critics(spec, dimensions, parts.n_critics, config.net_arch, config.activation, parts.outputs, parts.layer_norm)
     optimizer = optax.scale_by_adam()
+
+    def gaussian(params: Float[Array, " P"], obs: Observation) -> Float[Array, "M D2"]:
+        return policy.apply(params, obs)[..., : 2 * dimensions]
+
+    def explore(acting: Acting, obs: Observation, noise: Array) -> Float[Array, "M D"]:
+        if smooth is None:
+            return sample_squashed(gaussian(acting.actor, obs), noise)[0]
+        return jnp.tanh(state_dependent_sample(policy.apply(acting.actor, obs), noise))
 
     def init(key: Key[Array, ""]) -> Learnt:
         key_policy, key_critics = jax.random.split(key)
@@ -135,7 +153,7 @@ def soft_actor_critic(name: str, config: Settings, parts: Parts, spec: EnvSpec, 
         return parts.errors(values, target, batch.weight), jnp.mean(values)
 
     def learn(learnt: Learnt, batch: Transitions, drawn: Drawn, rate: Array, number: Array) -> tuple[Learnt, Metrics]:
-        next_action, next_log_prob = sample_squashed(policy.apply(learnt.policy.actor.params, batch.next_obs), drawn.noise[0])
+        next_action, next_log_prob = sample_squashed(gaussian(learnt.policy.actor.params, batch.next_obs), drawn.noise[0])
         judges = chosen_critics(learnt.target_params, drawn.ranks, parts.n_target_critics)
         next_values = parts.pessimism(net.apply(judges, batch.next_obs, next_action))
         entropy_bonus = parts.heat.of(learnt.policy) * next_log_prob
@@ -147,33 +165,35 @@ def soft_actor_critic(name: str, config: Settings, parts: Parts, spec: EnvSpec, 
             return parts.objective(net.apply(judged.params, obs, action))
 
         def improve(held: SoftPolicy) -> tuple[SoftPolicy, Metrics]:
-            return improve_policy(held, policy.apply, q_of, batch.obs, drawn.noise[1], batch.weight, parts.heat, optimizer, rate)
+            return improve_policy(held, gaussian, q_of, batch.obs, drawn.noise[1], batch.weight, parts.heat, optimizer, rate)
 
         better, metrics = every(parts.policy_delay, number, improve, learnt.policy)
         metrics |= {"train/critic_loss": loss, "train/q_mean": q_mean, "train/critic_grad_norm": norm}
         return Learnt(better, judged, follow(learnt.target_params, judged.params, parts.tau)), metrics
 
     def greedy(acting: Acting, obs: Observation) -> Float[Array, "M D"]:
-        return squashed_mode(policy.apply(acting.actor, obs))
+        return squashed_mode(gaussian(acting.actor, obs))
 
     method = Method(
         name=name,
         dimensions=dimensions,
         init=init,
         acting=lambda learnt: Acting(learnt.policy.actor.params, learnt.critics.params),
-        explore=lambda acting, obs, noise: sample_squashed(policy.apply(acting.actor, obs), noise)[0],
+        explore=explore,
         greedy=greedy,
         value=lambda acting, obs: parts.objective(net.apply(acting.critics, obs, greedy(acting, obs))),
         draw=draw,
         learn=learn,
+        features=0 if smooth is None else noise_features(config.net_arch[-1]),
     )
-    return off_policy(method, config, spec)
+    return off_policy(method, config, spec) if smooth is None else with_held_noise(off_policy(method, config, spec), smooth.sample_freq)
 
 
 def sac(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) -> Algorithm:
     """SAC for an environment with Box actions. Raises ``UserError`` for other action spaces."""
     over = jnp.min if config.policy_objective == "min" else jnp.mean
     parts = Parts(
+        exploration=state_dependent(config.use_sde, config.sde_sample_freq, config.log_std_init, config.noise_color),
         heat=temperature(config.ent_coef, config.target_entropy, spec.action_space),
         ent_coef_init=config.ent_coef_init,
         tau=config.tau,

@@ -24,6 +24,7 @@ from thorndike.functional.policy_losses import weighted_mean
 from thorndike.networks.continuous import box_dimensions, critics, policy_outputs
 from thorndike.networks.network import NetworkBuilder
 from thorndike.networks.torso import ACTIVATIONS
+from thorndike.replay.hindsight import STRATEGIES
 from thorndike.replay.off_policy import Method, Settings, off_policy
 from thorndike.replay.uniform import Transitions
 from thorndike.settings import AtLeast, Between, OneOf, check
@@ -49,6 +50,8 @@ class Config:
     target_noise_clip: Annotated[float, AtLeast(0)] = 0.5  # c: what that noise is clipped to
     action_noise: Annotated[float, AtLeast(0)] = 0.1  # sigma: deviation of the exploration noise
     noise_color: Annotated[float, AtLeast(0)] = 0.0  # exploration noise over time: 0 white, 1 pink, 2 red
+    goal_selection_strategy: Annotated[str, OneOf(*STRATEGIES)] = "none"  # HER: where replay finds other goals; for goal environments
+    n_sampled_goal: Annotated[int, AtLeast(1)] = 4  # k: transitions with another goal for each one with its own
     net_arch: tuple[int, ...] = (256, 256)  # widths of the hidden layers
     activation: Annotated[str, OneOf(*ACTIVATIONS)] = "relu"  # after each hidden layer
 

@@ -17,6 +17,7 @@ from thorndike.environments.native.vectorize import Dynamics
 from thorndike.errors import UserError
 from thorndike.networks.network import NetworkBuilder
 from thorndike.networks.torso import is_image
+from thorndike.replay.hindsight import goal_of
 from thorndike.suggestions import did_you_mean
 from thorndike.training.actor_threads import SCHEDULES, ActorThreads, threaded_source
 from thorndike.training.devices import devices_for
@@ -277,6 +278,12 @@ def is_large(request_algorithm: str, choice: registry.Choice) -> bool:
 
 def _learner(request: Request, spec: EnvSpec, wrapper: Wrapper, build: Callable[[EnvSpec], Algorithm]) -> tuple[Algorithm, Plan]:
     algorithm = build(wrapper.spec(spec))
+    if request.config.get("goal_selection_strategy", "none") != "none":
+        goal_of(spec)
+        if wrapper.name:
+            raise UserError(
+                f"{request.algorithm}: hindsight needs goals as the environment gives them: leave out the wrapper {wrapper.name}"
+            )
     per_iteration = algorithm.needs.rollout_length * request.num_envs
     lengths = (request.steps, request.log_every, request.checkpoint_every)
     iterations, log_every, checkpoint_every = (max(1, math.ceil(n / per_iteration)) for n in lengths)

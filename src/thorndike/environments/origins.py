@@ -5,6 +5,7 @@ Kept free of JAX: a wrong name is rejected before it is imported, and worker pro
 
 import copy
 import importlib
+import importlib.metadata
 import importlib.util
 import sys
 import warnings
@@ -35,7 +36,13 @@ def is_known_id(name: str) -> bool:
     elif id.startswith("MinAtar/") and id not in gymnasium.registry and importlib.util.find_spec("minatar") is not None:
         # Not by itself when Gymnasium starts: it brings Matplotlib, Seaborn and pandas.
         importlib.import_module("minatar.gym").register_envs()
+    elif id.startswith(_ROBOTICS) and id not in gymnasium.registry and importlib.util.find_spec("gymnasium_robotics") is not None:
+        gymnasium.register_envs(importlib.import_module("gymnasium_robotics"))
     return id in gymnasium.registry
+
+
+_ROBOTICS = ("Fetch", "HandReach", "HandManipulate", "AdroitHand", "PointMaze", "AntMaze", "FrankaKitchen")
+"""How the ids of Gymnasium-robotics begin."""
 
 
 def missing_package(id: str) -> str | None:
@@ -44,6 +51,14 @@ def missing_package(id: str) -> str | None:
         return f"{id} needs the Atari package: pip install 'thorndike[atari]'"
     if id.startswith("MinAtar/") and importlib.util.find_spec("minatar") is None:
         return f"{id} trains without it, but is evaluated and filmed on the package minatar: pip install 'thorndike[minatar]'"
+    if id.startswith(_ROBOTICS) and id not in gymnasium.registry and importlib.util.find_spec("gymnasium_robotics") is None:
+        return f"{id} needs the robotics package: pip install 'thorndike[robotics]'"
+    spec = gymnasium.registry.get(id)
+    robot = spec is not None and str(spec.entry_point).startswith(
+        ("gymnasium_robotics.envs.fetch", "gymnasium_robotics.envs.shadow_dexterous")
+    )
+    if robot and int(importlib.metadata.version("mujoco").partition(".")[0]) >= 4:
+        return f"{id} does not start on mujoco 4 (gymnasium-robotics 1.4.2 cannot read its joints there): pip install 'mujoco<4'"
     return None
 
 

@@ -18,7 +18,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 from thorndike.environments.host.envpool_ids import SAME_AS_GYMNASIUM, pool_ids, pool_is_installed
-from thorndike.environments.native import NATIVE, factory, settings_of
+from thorndike.environments.native import NATIVE, factory, is_only_native, settings_of
 from thorndike.errors import UserError
 from thorndike.suggestions import did_you_mean, nearest
 
@@ -172,7 +172,7 @@ def _engine_of_name(name: str, engine: str, settings: dict[str, object]) -> str:
         return "envpool"
     if engine == "auto" and not settings and name in SAME_AS_GYMNASIUM and pool_is_installed():
         return "envpool"
-    if name.startswith("probe/") and name in NATIVE:
+    if is_only_native(name):
         raise UserError(f"{name} exists as a native engine alone, and takes no settings {sorted(settings)}: use engine='native'")
     if _gymnasium_has(name):
         return _host_or_table(name, engine, settings)
@@ -300,7 +300,7 @@ def _unknown(name: str, engine: str) -> str:
 
 def _only_native(choice: Choice) -> bool:
     """Whether Gymnasium has no environment of this choice."""
-    return choice.engine == "native" and (not _is_gymnasium_origin(choice) or choice.id.startswith("probe/"))
+    return choice.engine == "native" and (not _is_gymnasium_origin(choice) or is_only_native(choice.id))
 
 
 def _is_gymnasium_origin(choice: Choice) -> bool:

@@ -6,6 +6,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int, Key, UInt32
 
+from thorndike.errors import UserError
+
 _LARGEST = 16
 """Bits of a row's number, at most: half of a word."""
 
@@ -39,3 +41,16 @@ def minibatches(key: Key[Array, ""], n: int, epochs: int, batch_size: int) -> In
     The rows themselves are gathered where a minibatch is used: a copy of every pass would hold a rollout of images ten times.
     """
     return permutations(key, epochs, n).reshape(-1, batch_size)
+
+
+def minibatch_size(algorithm: str, n_steps: int, num_envs: int, batch_size: int, sequences: bool = False) -> int:
+    """Items of a minibatch: rows of a rollout, or whole ``sequences``, one an environment. Raises ``UserError`` if they do not divide."""
+    rows = n_steps * num_envs
+    items, each = (num_envs, n_steps) if sequences else (rows, 1)
+    size = min(max(1, batch_size // each), items)
+    if items % size:
+        raise UserError(
+            f"{algorithm}: n_steps x environments = {n_steps} x {num_envs} = {rows} rows do not divide into minibatches of "
+            f"batch_size {batch_size}; choose a batch_size that divides {rows}" + (f" and {each} divides" if sequences else "")
+        )
+    return size

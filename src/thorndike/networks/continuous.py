@@ -12,25 +12,32 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Key
 
 from thorndike.errors import UserError
+from thorndike.functional.held_noise import noise_features, state_dependent_parameters, with_constant
 from thorndike.networks.masking import observed, without_mask
 from thorndike.networks.network import Network, NetworkBuilder, flattened
 from thorndike.networks.torso import ACTIVATIONS, Torso, example_observation, flatten_observation, is_image, torch_uniform
-from thorndike.types import EnvSpec, Observation
+from thorndike.types import EnvSpec, Number, Observation
 
 
 class PolicyOutputs(nn.Module):
-    """What a policy is made of, ``[B, outputs]``, from the observation."""
+    """What a policy is made of, ``[B, outputs]``, from the observation; with ``state_dependent`` exploration, what held_noise.py says."""
 
     space: gymnasium.Space
     outputs: int
     hidden: Sequence[int]
     activation: str
+    state_dependent: bool = False
+    log_std_init: Number = 0.0
 
     @nn.compact
     def __call__(self, obs: Observation) -> Float[Array, "B P"]:
         """Observation ``[B, ...]`` to the policy's parameters."""
         features = Torso(self.space, self.hidden, self.activation, torch_uniform, name="torso")(obs)
-        return nn.Dense(self.outputs, kernel_init=torch_uniform, name="policy")(features)
+        outputs = nn.Dense(self.outputs, kernel_init=torch_uniform, name="policy")(features)
+        if not self.state_dependent:
+            return outputs
+        log_std = self.param("log_std", nn.initializers.constant(self.log_std_init), (noise_features(features.shape[-1]), self.outputs))
+        return state_dependent_parameters(outputs, with_constant(features), log_std)
 
 
 class ActionValue(nn.Module):
@@ -59,6 +66,21 @@ def features_of(space: gymnasium.Space, obs: Observation, hidden: Sequence[int],
     return flatten_observation(without_mask(space), observed(space, obs))
 
 
+class StateDependent(NamedTuple):
+    """Generalised state-dependent exploration."""
+
+    sample_freq: int
+    """Steps that its noise is held for; -1: a rollout's length."""
+    log_std_init: Number
+
+
+def state_dependent(use_sde: bool, sample_freq: int, log_std_init: Number, noise_color: float) -> StateDependent | None:
+    """From the settings. Raises ``UserError`` where noise would be correlated in two ways at once."""
+    if use_sde and noise_color > 0.0:
+        raise UserError(f"use_sde holds its noise already: set noise_color to 0, not {noise_color:g}")
+    return StateDependent(sample_freq, log_std_init) if use_sde else None
+
+
 class Critics(NamedTuple):
     """An ensemble of K critics, whose parameters are one array ``[K, P]``."""
 
@@ -79,13 +101,23 @@ def box_dimensions(algorithm: str, spec: EnvSpec) -> int:
 
 
 def policy_outputs(
-    spec: EnvSpec, outputs: int, hidden: Sequence[int], activation: str, given: NetworkBuilder | None = None
+    spec: EnvSpec,
+    outputs: int,
+    hidden: Sequence[int],
+    activation: str,
+    given: NetworkBuilder | None = None,
+    exploration: StateDependent | None = None,
 ) -> tuple[Network, Callable[[Key[Array, ""]], Float[Array, " P"]]]:
     """The policy's network with its parameters as one flat vector, and what makes such a vector; the user's own network if one is given.
 
-    Raises ``UserError`` for a network with memory.
+    Raises ``UserError`` for a network with memory, or one of the user's own with state-dependent ``exploration``.
     """
-    module = PolicyOutputs(spec.observation_space, outputs, tuple(hidden), activation)
+    if exploration is not None and (given is not None or not hidden):
+        raise UserError(
+            "use_sde explores by the last hidden layer of the library's own network: set it to false, or leave the network as is"
+        )
+    start = 0.0 if exploration is None else exploration.log_std_init
+    module = PolicyOutputs(spec.observation_space, outputs, tuple(hidden), activation, exploration is not None, start)
     made = Network(lambda key, obs: module.init(key, obs)["params"], lambda params, obs: module.apply({"params": params}, obs))
     network = made if given is None else given(spec, outputs)
     if network.recurrence is not None:

@@ -5,10 +5,13 @@ from typing import NamedTuple
 
 import flax.linen as nn
 import gymnasium
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from thorndike.functional.action_distributions import ActionDistribution
+from thorndike.errors import UserError
+from thorndike.functional.action_distributions import ActionDistribution, action_distribution
+from thorndike.functional.held_noise import noise_features, state_dependent_parameters, with_constant
 from thorndike.networks.dense import dense
 from thorndike.networks.masking import masked
 from thorndike.networks.network import Network, NetworkBuilder
@@ -26,6 +29,7 @@ class ActorCritic(nn.Module):
     hidden: Sequence[int]
     activation: str
     log_std_init: Number
+    state_dependent: bool = False
 
     @nn.compact
     def __call__(self, obs: Observation) -> tuple[Float[Array, "B P"], Float[Array, " B"]]:
@@ -37,12 +41,8 @@ class ActorCritic(nn.Module):
             value_features = features
         else:
             value_features = Torso(self.space, self.hidden, self.activation, hidden_init, name="value_torso")(obs)
-        parameters = dense(self.outputs, nn.initializers.orthogonal(0.01), name="policy")(features)
+        parameters = policy_parameters(self, features)
         value = dense(1, nn.initializers.orthogonal(1.0), name="value")(value_features)
-        if self.free_parameters:
-            log_std = self.param("log_std", nn.initializers.constant(self.log_std_init), (self.free_parameters,))
-            spread = jnp.broadcast_to(log_std, (*parameters.shape[:-1], self.free_parameters))
-            parameters = jnp.concatenate([parameters, spread], axis=-1)
         return parameters, value[..., 0]
 
 
@@ -52,15 +52,28 @@ class PolicyHead(nn.Module):
     outputs: int
     free_parameters: int
     log_std_init: Number
+    state_dependent: bool = False
 
     @nn.compact
     def __call__(self, features: Float[Array, "B F"]) -> Float[Array, "B P"]:
         """Features to policy parameters."""
-        parameters = dense(self.outputs, nn.initializers.orthogonal(0.01), name="policy")(features)
-        if not self.free_parameters:
-            return parameters
-        log_std = self.param("log_std", nn.initializers.constant(self.log_std_init), (self.free_parameters,))
-        return jnp.concatenate([parameters, jnp.broadcast_to(log_std, (*parameters.shape[:-1], self.free_parameters))], axis=-1)
+        return policy_parameters(self, features)
+
+
+def policy_parameters(module: ActorCritic | PolicyHead, features: Float[Array, "B F"]) -> Float[Array, "B P"]:
+    """The policy's parameters from its features, within a module that says how: those of the network, then the free ones.
+
+    With ``state_dependent`` exploration, what ``state_dependent_parameters`` makes of them; features are learnt for the mean alone.
+    """
+    parameters = dense(module.outputs, nn.initializers.orthogonal(0.01), name="policy")(features)
+    start = nn.initializers.constant(module.log_std_init)
+    if module.state_dependent:
+        log_std = module.param("log_std", start, (noise_features(features.shape[-1]), module.outputs))
+        return state_dependent_parameters(parameters, with_constant(jax.lax.stop_gradient(features)), log_std)
+    if not module.free_parameters:
+        return parameters
+    log_std = module.param("log_std", start, (module.free_parameters,))
+    return jnp.concatenate([parameters, jnp.broadcast_to(log_std, (*parameters.shape[:-1], module.free_parameters))], axis=-1)
 
 
 class ValueHead(nn.Module):
@@ -78,11 +91,12 @@ class PolicyAndValue(nn.Module):
     outputs: int
     free_parameters: int
     log_std_init: Number
+    state_dependent: bool = False
 
     @nn.compact
     def __call__(self, features: Float[Array, "B F"]) -> tuple[Float[Array, "B P"], Float[Array, " B"]]:
         """Features to policy parameters and value."""
-        return PolicyHead(self.outputs, self.free_parameters, self.log_std_init)(features), ValueHead()(features)
+        return PolicyHead(self.outputs, self.free_parameters, self.log_std_init, self.state_dependent)(features), ValueHead()(features)
 
 
 class QHead(nn.Module):
@@ -139,10 +153,16 @@ def combined(value: Float[Array, "*B K"], advantage: Float[Array, "*B AK"]) -> F
 
 
 def actor_critic(
-    space: gymnasium.Space, outputs: int, free_parameters: int, hidden: Sequence[int], activation: str, log_std_init: Number = 0.0
+    space: gymnasium.Space,
+    outputs: int,
+    free_parameters: int,
+    hidden: Sequence[int],
+    activation: str,
+    log_std_init: Number = 0.0,
+    state_dependent: bool = False,
 ) -> Network:
-    """A policy and its value. ``outputs`` is ``P`` less the ``free_parameters`` that do not depend on the observation."""
-    return _pair(ActorCritic(space, outputs, free_parameters, tuple(hidden), activation, log_std_init))
+    """A policy and its value. ``outputs`` is what the network computes of ``P``: see ``policy_parameters``."""
+    return _pair(ActorCritic(space, outputs, free_parameters, tuple(hidden), activation, log_std_init, state_dependent))
 
 
 def q_values(
@@ -173,17 +193,37 @@ class Shape(NamedTuple):
 def policy_network(
     spec: EnvSpec, distribution: ActionDistribution, shape: Shape, log_std_init: Number, given: NetworkBuilder | None = None
 ) -> Network:
-    """A policy and its value for an environment, masks honoured; the user's own if one is ``given``."""
+    """A policy and its value for an environment, masks honoured; the user's own if one is ``given``.
+
+    Raises ``UserError`` for one of the user's own with state-dependent exploration, which needs its last features.
+    """
     if given is not None:
+        if distribution.features:
+            raise UserError("use_sde explores by the features of the library's own network: set use_sde to false, or give no network")
         return masked(given(spec, distribution.network_outputs + distribution.free_parameters), spec)
-    outputs, free, hidden_init = distribution.network_outputs, distribution.free_parameters, nn.initializers.orthogonal(2.0**0.5)
+    hidden_init = nn.initializers.orthogonal(2.0**0.5)
+    outputs, free, smooth = distribution.network_outputs, distribution.free_parameters, distribution.features > 0
     if shape.memory == "none":
-        return masked(actor_critic(spec.observation_space, outputs, free, shape.net_arch, shape.activation, log_std_init), spec)
+        return masked(actor_critic(spec.observation_space, outputs, free, shape.net_arch, shape.activation, log_std_init, smooth), spec)
     if is_image(spec.observation_space):
-        return masked(_remembering(spec, shape, hidden_init, PolicyAndValue(outputs, free, log_std_init)), spec)
+        return masked(_remembering(spec, shape, hidden_init, PolicyAndValue(outputs, free, log_std_init, smooth)), spec)
     # One memory for both would be shaped by the value's gradient, which is far larger: the policy then learns nothing (measured).
-    policy = _remembering(spec, shape, hidden_init, PolicyHead(outputs, free, log_std_init))
+    policy = _remembering(spec, shape, hidden_init, PolicyHead(outputs, free, log_std_init, smooth))
     return masked(side_by_side(policy, _remembering(spec, shape, hidden_init, ValueHead())), spec)
+
+
+def stochastic_policy(
+    spec: EnvSpec, shape: Shape, kind: str, use_sde: bool, log_std_init: Number, given: NetworkBuilder | None = None
+) -> tuple[ActionDistribution, Network]:
+    """How actions are distributed, by the settings ``action_distribution`` and ``use_sde``, and the network that says so, with its value.
+
+    Raises ``UserError`` where these, the action space and the network do not go together.
+    """
+    if use_sde and shape.memory == "none" and not shape.net_arch:
+        raise UserError("use_sde explores by the features of the last hidden layer: net_arch needs one")
+    width = shape.net_arch[-1] if shape.memory == "none" and shape.net_arch else shape.memory_size
+    distribution = action_distribution(spec.action_space, kind, noise_features(width) if use_sde else 0)
+    return distribution, policy_network(spec, distribution, shape, log_std_init, given)
 
 
 def q_network(spec: EnvSpec, actions: int, shape: Shape, dueling: bool, given: NetworkBuilder | None = None) -> Network:

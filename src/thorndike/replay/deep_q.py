@@ -21,6 +21,7 @@ from thorndike.networks.heads import Shape
 from thorndike.networks.masking import allowed, has_mask
 from thorndike.networks.network import NetworkBuilder, apply_step, fresh_memory
 from thorndike.networks.value_network import Form, value_network
+from thorndike.replay.hindsight import Hindsight, replay_for
 from thorndike.replay.pace import Pace, pace
 from thorndike.replay.replay import Replay, Ring, prioritized_replay, sequence_replay, uniform_replay
 from thorndike.replay.uniform import row_shapes
@@ -131,6 +132,7 @@ class Options(NamedTuple):
     noisy_sigma: Number | None = None
     munchausen: Munchausen | None = None
     memory: Memory | None = None
+    hindsight: Hindsight | None = None
     reset_every: int = 0
     """Environment steps between new beginnings of the network; 0: never."""
     temperature: Number | str | Rate | None = None
@@ -241,10 +243,12 @@ def build_parts(name: str, config: Settings, options: Options, spec: EnvSpec, ne
     ring = Ring(row_shapes(spec, fresh_memory(net.network, 1)), plan_of(name, config, options, spec.num_envs).ring_steps, spec.num_envs)
     optimizer = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam(eps=config.adam_eps))
     rule = Rule(options.distribution, options.double, options.munchausen)
-    return Parts(net, rule, _replay(config, options, ring), optimizer, config.gamma)
+    return Parts(net, rule, _replay(config, options, ring, spec), optimizer, config.gamma)
 
 
-def _replay(config: Settings, options: Options, ring: Ring) -> Replay:
+def _replay(config: Settings, options: Options, ring: Ring, spec: EnvSpec) -> Replay:
+    if options.hindsight is not None:
+        return replay_for(ring, config.batch_size, config.gamma, options.hindsight, spec)
     if options.memory is not None:
         length = options.memory.sequence_length
         return sequence_replay(ring, max(1, config.batch_size // length), length)
@@ -261,5 +265,10 @@ def refuse_what_does_not_go_together(name: str, options: Options) -> None:
         raise UserError(f"{name} with memory learns from sequences drawn uniformly: set prioritized to false, or memory to none")
     if options.temperature is not None and options.noisy_sigma is not None:
         raise UserError(f"{name} with noisy layers explores by them alone: set exploration to epsilon, or noisy to false")
+    if options.hindsight is not None and (options.n_step > 1 or options.memory is not None or options.priorities is not None):
+        raise UserError(
+            f"{name} relabels single steps, drawn uniformly: set n_step to 1, prioritized to false and memory to none, or "
+            "goal_selection_strategy to none"
+        )
     if options.munchausen is not None and (options.n_step > 1 or options.double):
         raise UserError(f"{name} with munchausen has a target of its own, of single steps: set n_step to 1 and double to false")

@@ -13,8 +13,10 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from thorndike.functional.coloured_noise import coloured_noise
 from thorndike.functional.guards import accept_if, all_finite
 from thorndike.functional.schedules import schedule
+from thorndike.replay.hindsight import Hindsight, replay_for
 from thorndike.replay.pace import pace
-from thorndike.replay.uniform import ReplayBuffer, Transitions, add, init_replay, row_shapes, sample
+from thorndike.replay.replay import Ring
+from thorndike.replay.uniform import Transitions, row_shapes
 from thorndike.types import Algorithm, EnvSpec, Metrics, Needs, Observation, Rollout
 
 
@@ -59,6 +61,14 @@ class Settings(Protocol):
         """Of the exploration noise over time: 0 white, 1 pink, 2 red."""
 
     @property
+    def goal_selection_strategy(self) -> str:
+        """Where replay finds other goals: see ``hindsight.py``."""
+
+    @property
+    def n_sampled_goal(self) -> int:
+        """Transitions with another goal for each one with its own."""
+
+    @property
     def net_arch(self) -> tuple[int, ...]:
         """Widths of the hidden layers."""
 
@@ -77,7 +87,7 @@ class Method(NamedTuple):
     """key -> all that is learnt. Consumes the key."""
     acting: Callable[[PyTree], PyTree]
     """The learnt -> the part that acting and valuing need."""
-    explore: Callable[[PyTree, Observation, Float[Array, "M D"]], Float[Array, "M D"]]
+    explore: Callable[[PyTree, Observation, Float[Array, "M D"] | Float[Array, "M H D"]], Float[Array, "M D"]]
     """acting part, obs, standard normal noise -> action while learning."""
     greedy: Callable[[PyTree, Observation], Float[Array, "M D"]]
     value: Callable[[PyTree, Observation], Float[Array, " M"]]
@@ -85,6 +95,8 @@ class Method(NamedTuple):
     """key, number of updates -> their random numbers, leading with the update. Consumes the key."""
     learn: Callable[[PyTree, Transitions, PyTree, Float[Array, ""], Int[Array, ""]], tuple[PyTree, Metrics]]
     """The learnt, a minibatch, random numbers of this update, learning rate, number of the update -> the learnt, metrics."""
+    features: int = 0
+    """H: above 0, exploration depends on the state; its noise is ``[M, H, D]`` and comes as ``HeldNoise``."""
 
 
 class State(NamedTuple):
@@ -92,7 +104,7 @@ class State(NamedTuple):
 
     learnt: PyTree
     updates: Int[Array, ""]
-    replay: ReplayBuffer
+    replay: PyTree
     env_steps: Int[Array, ""]
 
 
@@ -128,32 +140,36 @@ def off_policy(method: Method, config: Settings, spec: EnvSpec) -> Algorithm:
     plan = pace(method.name, *sizes, spec.num_envs)
     per_iteration = plan.rollout_length * spec.num_envs
     learning_rate = schedule(config.learning_rate)
+    ring = Ring(row_shapes(spec), plan.ring_steps, spec.num_envs)
+    hindsight = Hindsight(config.goal_selection_strategy, config.n_sampled_goal)
+    noise_shape = (spec.num_envs, *((method.features,) if method.features else ()), method.dimensions)
+    memory = replay_for(ring, config.batch_size, config.gamma, hindsight, spec)
 
     def init(key: Key[Array, ""]) -> State:
-        replay = init_replay(row_shapes(spec), plan.ring_steps, spec.num_envs)
-        return State(method.init(key), jnp.zeros((), jnp.int32), replay, jnp.zeros((), jnp.int32))
+        return State(method.init(key), jnp.zeros((), jnp.int32), memory.init(), jnp.zeros((), jnp.int32))
 
     def actor(state: State) -> Actor:
         return Actor(method.acting(state.learnt), state.env_steps < config.learning_starts)
 
-    def act(actor: Actor, memory: PyTree, obs: Observation, noise: Float[Array, "B D"]) -> tuple[PyTree, Float[Array, "B D"], PyTree]:
+    def act(actor: Actor, memory: PyTree, obs: Observation, noise: PyTree) -> tuple[PyTree, Float[Array, "B D"], PyTree]:
+        smooth, white = (noise.held, noise.fresh[..., 0, :]) if method.features else (noise, noise)
         # The distribution function of the normal makes its noise uniform: no second draw.
-        uniform = jax.scipy.special.erf(noise * 0.5**0.5)
-        return memory, jnp.where(actor.at_random, uniform, method.explore(actor.learnt, obs, noise)), {}
+        uniform = jax.scipy.special.erf(white * 0.5**0.5)
+        return memory, jnp.where(actor.at_random, uniform, method.explore(actor.learnt, obs, smooth)), {}
 
     def observe(state: State, rollout: Rollout, key: Key[Array, ""]) -> tuple[State, Metrics]:
-        return state._replace(replay=add(state.replay, rollout), env_steps=state.env_steps + per_iteration), {}
+        return state._replace(replay=memory.add(state.replay, rollout), env_steps=state.env_steps + per_iteration), {}
 
     def update(state: State, rollout: Rollout, key: Key[Array, ""]) -> tuple[State, Metrics]:
         rate = learning_rate(state.env_steps / config.total_steps)
-        replay = add(state.replay, rollout)
+        replay = memory.add(state.replay, rollout)
         # One key more than updates: from a single one the compiler would take the sampling out of the loop (see ``repeated``).
         keys = jax.random.split(key, plan.gradient_steps + 1)
         drawn = method.draw(keys[-1], plan.gradient_steps)
 
         def one(learnt: PyTree, i: Int[Array, ""]) -> tuple[PyTree, Metrics]:
             noise = jax.tree.map(lambda x: x[i], drawn)
-            batch = sample(replay, keys[i], config.batch_size, spec.num_envs, 1, config.gamma)
+            batch = memory.sample(replay, keys[i], jnp.ones(())).batch
             after, metrics = method.learn(learnt, batch, noise, rate, state.updates + i)
             return accept_if(all_finite(*metrics.values()), after, learnt), metrics
 
@@ -165,7 +181,7 @@ def off_policy(method: Method, config: Settings, spec: EnvSpec) -> Algorithm:
         init=init,
         actor=actor,
         memory=lambda batch: (),
-        draw=lambda key, steps: coloured_noise(key, steps, (spec.num_envs, method.dimensions), config.noise_color),
+        draw=lambda key, steps: coloured_noise(key, steps, noise_shape, config.noise_color),
         act=act,
         greedy=lambda actor, memory, obs, noise: (memory, method.greedy(actor.learnt, obs), {}),
         value=lambda actor, obs: method.value(actor.learnt, obs),

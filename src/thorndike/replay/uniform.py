@@ -98,7 +98,7 @@ def sample(buffer: ReplayBuffer, key: Key[Array, ""], batch_size: int, num_envs:
     The cost does not grow with the ring's size. With ``n_step > 1`` the newest ``n_step - 1`` steps are not drawn: what follows them is
     not stored yet.
     """
-    return transitions_at(buffer, _draw(buffer, key, batch_size, num_envs, n_step), num_envs, n_step, gamma)
+    return transitions_at(buffer, drawn_rows(buffer, key, batch_size, num_envs, n_step), num_envs, n_step, gamma)
 
 
 def transitions_at(buffer: ReplayBuffer, index: Int[Array, " M"], num_envs: int, n_step: int, gamma: Number) -> Transitions:
@@ -126,7 +126,7 @@ def sample_sequences(buffer: ReplayBuffer, key: Key[Array, ""], count: int, leng
     Its memory is the one its first action was chosen with, as stored (Kapturowski et al. 2019, "stored state").
     """
     total = jax.tree.leaves(buffer.rows)[0].shape[0]
-    first = _draw(buffer, key, count, num_envs, length)
+    first = drawn_rows(buffer, key, count, num_envs, length)
     window = (first[None, :] + num_envs * jnp.arange(length, dtype=jnp.int32)[:, None]) % total
     row = jax.tree.map(lambda x: x[window], {name: rows for name, rows in buffer.rows.items() if name != "memory"})
     step = Step(
@@ -142,7 +142,7 @@ def sample_sequences(buffer: ReplayBuffer, key: Key[Array, ""], count: int, leng
     return Rollout(row["obs"], row["action"], {}, step, memory)
 
 
-def _draw(buffer: ReplayBuffer, key: Key[Array, ""], count: int, num_envs: int, follow: int) -> Int[Array, " {count}"]:
+def drawn_rows(buffer: ReplayBuffer, key: Key[Array, ""], count: int, num_envs: int, follow: int) -> Int[Array, " {count}"]:
     """Rows after which ``follow - 1`` more steps of their environment are stored."""
     total = jax.tree.leaves(buffer.rows)[0].shape[0]
     newest_allowed = jnp.maximum(buffer.size - (follow - 1), 1)

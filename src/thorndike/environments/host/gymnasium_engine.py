@@ -30,6 +30,7 @@ from thorndike.environments.host.checks import (
     storer,
 )
 from thorndike.environments.host.faults import Fault, as_fault, named, reset_name
+from thorndike.environments.host.goals import find_goal
 from thorndike.environments.host.steps import host_spec, host_step
 from thorndike.errors import UserError
 from thorndike.types import Observation, Step
@@ -46,7 +47,7 @@ class LoopEngine:
         first, count = self._envs[0], len(makers)
         space = first.observation_space
         check_spaces(space, first.action_space, id)
-        self.spec = host_spec(id, space, first.action_space, count, max_episode_steps, "gymnasium")
+        self.spec = host_spec(id, space, first.action_space, count, max_episode_steps, "gymnasium")._replace(goal=find_goal(first))
         self._convert = action_converter(first.action_space)
         self._allocate, self._store, self._is_finite = allocator(space, count), storer(space), finite_test(space)
         # The same arrays in every step in which nothing ends or costs: a fresh one each would take as long as the checks.

@@ -20,6 +20,7 @@ import numpy as np
 
 from thorndike.environments.host.arrays import action_converter, check_seeds, check_spaces, duplicate, take, with_rows
 from thorndike.environments.host.faults import DEFAULT_TIMEOUTS, Fault, Timeouts, hung, named, one_line, reset_name
+from thorndike.environments.host.goals import find_goal
 from thorndike.environments.host.gymnasium_engine import MakeEnv
 from thorndike.environments.host.shared_block import create_block
 from thorndike.environments.host.steps import host_spec, host_step
@@ -51,9 +52,10 @@ class SubprocessEngine:
         """
         probe = makers[0]()
         observation, action = probe.observation_space, probe.action_space
+        goal = find_goal(probe)
         probe.close()
         check_spaces(observation, action, id)
-        self.spec = host_spec(id, observation, action, len(makers), max_episode_steps, "subprocess")
+        self.spec = host_spec(id, observation, action, len(makers), max_episode_steps, "subprocess")._replace(goal=goal)
         self._convert, self._timeouts, self._steps = action_converter(action), timeouts, 0
         self._workers: list[WorkerProcess] = []
         file, self._block = create_block(observation, action, len(makers))

@@ -21,6 +21,7 @@ NATIVE: Mapping[str, str] = MappingProxyType(
         "Pendulum-v1": "thorndike.environments.native.pendulum:pendulum",
         "Blackjack-v1": "thorndike.environments.native.blackjack:blackjack",
         "DeepSea-v0": "thorndike.environments.native.deep_sea:deep_sea",
+        "BitFlip-v0": "thorndike.environments.native.bit_flip:bit_flip",
         "MinAtar/Asterix-v0": "thorndike.environments.native.minatar.asterix:asterix",
         "MinAtar/Asterix-v1": "thorndike.environments.native.minatar.asterix:asterix_minimal",
         "MinAtar/Breakout-v0": "thorndike.environments.native.minatar.breakout:breakout",
@@ -51,6 +52,11 @@ NATIVE: Mapping[str, str] = MappingProxyType(
     }
 )
 """Environment id -> ``module:factory``. A factory takes Gymnasium's own settings of that environment, by keyword."""
+
+
+def is_only_native(id: str) -> bool:
+    """Whether a native environment exists nowhere else."""
+    return id in NATIVE and (id.startswith("probe/") or id == "BitFlip-v0")
 
 
 def factory(id: str) -> "Callable[..., Dynamics]":

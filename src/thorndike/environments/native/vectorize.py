@@ -23,7 +23,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int32, Key, PyTree
 
 from thorndike.errors import UserError
-from thorndike.types import Action, Environment, EnvSpec, Noise, Observation, Step
+from thorndike.types import Action, Environment, EnvSpec, Goal, Noise, Observation, Step
 
 
 class Dynamics(NamedTuple):
@@ -43,6 +43,8 @@ class Dynamics(NamedTuple):
     action_space: gymnasium.Space
     id: str
     max_episode_steps: int | None = None
+    goal: Goal | None = None
+    """Of a goal environment: what it rewards and ends for, by the goals alone."""
 
 
 class VectorState(NamedTuple):
@@ -96,7 +98,7 @@ def vectorize(dynamics: Dynamics, num_envs: int, max_episode_steps: int | None =
         )
         return VectorState(_where(done, fresh, after), _where(done, jax.tree.map(jnp.zeros_like, clock), clock)), result
 
-    spec = EnvSpec(dynamics.id, dynamics.observation_space, dynamics.action_space, num_envs, limit)
+    spec = EnvSpec(dynamics.id, dynamics.observation_space, dynamics.action_space, num_envs, limit, goal=dynamics.goal)
     return Environment(init, step, draw, spec)
 
 
