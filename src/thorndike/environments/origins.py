@@ -17,6 +17,7 @@ import gymnasium
 from gymnasium.vector import VectorEnv
 from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 
+from thorndike.environments.host.atari import atari_settings, is_preprocessed
 from thorndike.errors import UserError
 
 Settings: TypeAlias = Mapping[str, object]
@@ -95,6 +96,11 @@ def limit_of(environment: gymnasium.Env) -> int | None:
     return min((limit for limit in limits if limit is not None), default=None)
 
 
+def frames_of(environment: gymnasium.Env) -> int:
+    """How many successive frames an observation holds on its last axis, where the environment says so by ``frames_stacked``."""
+    return int(getattr(environment.unwrapped, "frames_stacked", 1))
+
+
 def class_in_file(name: str) -> tuple[Path, str] | None:
     """The parts of ``path/to/file.py:ClassName``, or None if `name` has not that form."""
     path, _, attribute = name.rpartition(":")
@@ -111,6 +117,10 @@ def _from_name(name: str, env_kwargs: Settings, max_episode_steps: int | None, r
     missing = missing_package(id)
     if missing is not None:
         raise UserError(missing)
+    if is_preprocessed(id, env_kwargs) and id in gymnasium.registry:
+        from thorndike.environments.host.atari_game import atari_game
+
+        return atari_game(id, atari_settings(env_kwargs), max_episode_steps, render_mode)
     settings = dict(env_kwargs)
     if render_mode is not None:
         settings["render_mode"] = render_mode

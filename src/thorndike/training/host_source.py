@@ -170,7 +170,8 @@ def _roll(
         wrapper_memory, step = moves.see(state.statistics, wrapper_memory, obs, decision.engine_action, raw)
         rows.append(Rollout(seen, decision.action, decision.extras, step, ()))
         tally.add(raw)
-        memory = moves.forget(raw.done | ~raw.valid, decision.memory)
+        # The learner's episode, which a wrapper may end before the environment's.
+        memory = moves.forget(step.done | ~step.valid, decision.memory)
         obs, seen = raw.obs, step.obs
     return state._replace(obs=obs, seen=seen, memory=memory, wrapper_memory=wrapper_memory), rows, tally
 
