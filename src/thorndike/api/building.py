@@ -16,6 +16,7 @@ from thorndike.errors import UserError
 from thorndike.networks.network import NetworkBuilder
 from thorndike.networks.torso import is_image
 from thorndike.suggestions import did_you_mean
+from thorndike.training.memory import check_memory
 from thorndike.training.host_source import HostEngine, HostSource, host_source
 from thorndike.training.presets import Preset
 from thorndike.training.runner import Runner, page_length, runner
@@ -190,6 +191,15 @@ def build_job(
         spec, close = engine.spec._replace(num_envs=request.num_envs), engine.close
         algorithm, plan = _learner(request, spec, wrapper, build)
         source = host_source(engine, algorithm, wrapper, request.seed, indices, plan.checkpoint_every)
+    if not algorithm.needs.on_policy:
+        buffer_size = request.config.get("buffer_size")
+        check_memory(
+            request.algorithm,
+            algorithm,
+            len(indices),
+            buffer_size if isinstance(buffer_size, int) else None,
+            twice=choice.engine != "native" and len(indices) > 1,
+        )
     bound = runner(algorithm, source, request.seed, indices)
     return Job(request, algorithm, wrapper, spec, source, bound, plan, close)
 

@@ -21,6 +21,7 @@ from thorndike.networks.heads import Shape
 from thorndike.networks.masking import allowed, has_mask
 from thorndike.networks.network import NetworkBuilder, apply_step, fresh_memory
 from thorndike.networks.value_network import Form, value_network
+from thorndike.replay.frames import once_each, stacks_of
 from thorndike.replay.pace import Pace, pace
 from thorndike.replay.replay import Replay, Ring, prioritized_replay, sequence_replay, uniform_replay
 from thorndike.replay.uniform import row_shapes
@@ -233,7 +234,9 @@ def build_parts(name: str, config: Settings, options: Options, spec: EnvSpec, ne
     ring = Ring(row_shapes(spec, fresh_memory(net.network, 1)), plan_of(name, config, options, spec.num_envs).ring_steps, spec.num_envs)
     optimizer = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam(eps=config.adam_eps))
     rule = Rule(options.distribution, options.double, options.munchausen)
-    return Parts(net, rule, _replay(config, options, ring), optimizer, config.gamma)
+    stacks, build = stacks_of(spec), partial(_replay, config, options)
+    replay = build(ring) if stacks is None else once_each(stacks, ring, build)
+    return Parts(net, rule, replay, optimizer, config.gamma)
 
 
 def _replay(config: Settings, options: Options, ring: Ring) -> Replay:
