@@ -104,7 +104,11 @@ def parts(batch) -> list[np.ndarray]:
 def test_frames_that_were_written_over_are_never_shown(filling):
     """Episodes of two steps need three times the frames that there is room for."""
     memories = [BUILDERS["uniform"](RING), once_each(Stacks(2, 3, CHANNELS, FRAMES), RING, BUILDERS["uniform"])]
-    stream, held, add = Stream(1, filling, False, mean_length=2.0), [memory.init() for memory in memories], [jax.jit(m.add) for m in memories]
+    stream, held, add = (
+        Stream(1, filling, False, mean_length=2.0),
+        [memory.init() for memory in memories],
+        [jax.jit(m.add) for m in memories],
+    )
     for _ in range(3 * STEPS // AT_ONCE):
         rollout = stream.rollout()
         held = [write(state, rollout) for write, state in zip(add, held, strict=True)]

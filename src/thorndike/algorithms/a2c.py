@@ -26,6 +26,7 @@ from thorndike.functional.guards import accept_if, all_finite
 from thorndike.functional.policy_losses import explained_variance, standardize, weighted_mean
 from thorndike.functional.returns import generalized_advantage
 from thorndike.functional.schedules import schedule
+from thorndike.networks.cnn import CNNS
 from thorndike.networks.heads import Shape, policy_network
 from thorndike.networks.network import Network, NetworkBuilder, apply_rollout, apply_step, fresh_memory
 from thorndike.networks.recurrent import MEMORIES
@@ -50,6 +51,7 @@ class Config:
     normalize_advantage: bool = False  # standardise the rollout's advantages
     net_arch: tuple[int, ...] = (64, 64)  # widths of the hidden layers
     activation: Annotated[str, OneOf(*ACTIVATIONS)] = "tanh"  # after each hidden layer
+    cnn: Annotated[str, OneOf(*CNNS)] = "nature"  # convolutions of images
     log_std_init: float = 0.0  # log standard deviation at the start (Box actions)
     memory: Annotated[str, OneOf(*MEMORIES)] = "none"  # recurrent memory of the network
     memory_size: Annotated[int, AtLeast(1)] = 64  # its width
@@ -96,7 +98,7 @@ def a2c_loss(
 def a2c(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) -> Algorithm:
     """A2C for an environment. Raises ``UserError`` where the action space is not supported."""
     distribution = action_distribution(spec.action_space)
-    shape = Shape(config.net_arch, config.activation, config.memory, config.memory_size)
+    shape = Shape(config.net_arch, config.activation, config.memory, config.memory_size, cnn=config.cnn)
     net = policy_network(spec, distribution, shape, config.log_std_init, network)
     optimizer = optax.chain(
         optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_rms(decay=0.99, eps=config.rms_prop_eps, eps_in_sqrt=False)

@@ -29,6 +29,7 @@ from thorndike.functional.guards import accept_if, all_finite
 from thorndike.functional.policy_losses import explained_variance, standardize, weighted_mean
 from thorndike.functional.returns import generalized_advantage
 from thorndike.functional.schedules import schedule
+from thorndike.networks.cnn import CNNS
 from thorndike.networks.heads import Shape, policy_network
 from thorndike.networks.network import Network, NetworkBuilder, apply_rollout, apply_step, fresh_memory
 from thorndike.networks.recurrent import MEMORIES
@@ -52,6 +53,7 @@ class Config:
     normalize_advantage: bool = True  # standardise the weights of a rollout's steps
     net_arch: tuple[int, ...] = (64, 64)  # widths of the hidden layers
     activation: Annotated[str, OneOf(*ACTIVATIONS)] = "tanh"  # after each hidden layer
+    cnn: Annotated[str, OneOf(*CNNS)] = "nature"  # convolutions of images
     log_std_init: float = 0.0  # log standard deviation at the start (Box actions)
     memory: Annotated[str, OneOf(*MEMORIES)] = "none"  # recurrent memory of the network
     memory_size: Annotated[int, AtLeast(1)] = 64  # its width
@@ -111,7 +113,7 @@ def reinforce(config: Config, spec: EnvSpec, network: NetworkBuilder | None = No
             f"{spec.id}; set n_steps={limit}, or baseline=true"
         )
     distribution = action_distribution(spec.action_space)
-    shape = Shape(config.net_arch, config.activation, config.memory, config.memory_size)
+    shape = Shape(config.net_arch, config.activation, config.memory, config.memory_size, cnn=config.cnn)
     net = policy_network(spec, distribution, shape, config.log_std_init, network)
     optimizer = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam(eps=1e-5))
     learning_rate, example = schedule(config.learning_rate), example_observation(spec.observation_space)

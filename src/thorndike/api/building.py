@@ -16,9 +16,9 @@ from thorndike.errors import UserError
 from thorndike.networks.network import NetworkBuilder
 from thorndike.networks.torso import is_image
 from thorndike.suggestions import did_you_mean
-from thorndike.training.memory import check_memory
 from thorndike.training.host_source import HostEngine, HostSource, host_source
-from thorndike.training.presets import Preset
+from thorndike.training.memory import check_memory
+from thorndike.training.presets import Preset, find_preset
 from thorndike.training.runner import Runner, page_length, runner
 from thorndike.training.session import Plan
 from thorndike.training.sources import compiled_source
@@ -95,6 +95,23 @@ def make(
     if choice.engine == "native":
         return registry.build_native(choice, num_envs)
     return registry.build_host(choice, num_envs, env_timeout=env_timeout)
+
+
+def choose(
+    algorithm: str,
+    environment: EnvironmentLike,
+    preset: str | None,
+    engine: str = "auto",
+    env_kwargs: Mapping[str, object] | None = None,
+    max_episode_steps: int | None = None,
+) -> tuple[registry.Choice, Preset]:
+    """The environment that is meant, with the preset's own settings of it where none are given, and the preset. Raises ``UserError``."""
+    choice = registry.resolve(environment, engine=engine, env_kwargs=env_kwargs, max_episode_steps=max_episode_steps)
+    found = find_preset(algorithm, choice.id, preset)
+    if found.env_kwargs:
+        both = {**found.env_kwargs, **(env_kwargs or {})}
+        choice = registry.resolve(environment, engine=engine, env_kwargs=both, max_episode_steps=max_episode_steps)
+    return choice, found
 
 
 def check_algorithm(algorithm: str) -> None:

@@ -30,7 +30,10 @@ def is_known_id(name: str) -> bool:
     if module:
         _import(module, name)
     elif id.startswith("ALE/") and importlib.util.find_spec("ale_py") is not None:
-        gymnasium.register_envs(importlib.import_module("ale_py"))
+        package = importlib.import_module("ale_py")
+        gymnasium.register_envs(package)
+        # It greets on stderr otherwise, once for each game.
+        package.ALEInterface.setLoggerMode(package.LoggerMode.Error)
     elif id.startswith("MinAtar/") and id not in gymnasium.registry and importlib.util.find_spec("minatar") is not None:
         # Not by itself when Gymnasium starts: it brings Matplotlib, Seaborn and pandas.
         importlib.import_module("minatar.gym").register_envs()

@@ -203,7 +203,9 @@ def _engine_of_atari(name: str, engine: str, settings: dict[str, object]) -> str
         raise UserError(_unknown(name, engine))
     if not is_preprocessed(name, settings):
         if engine in ("ale", "envpool"):
-            raise UserError(f"{name} with {sorted(settings)} is the raw game, which engine={engine!r} does not have: use engine='gymnasium'")
+            raise UserError(
+                f"{name} with {sorted(settings)} is the raw game, which engine={engine!r} does not have: use engine='gymnasium'"
+            )
         return "gymnasium" if engine == "auto" else engine
     atari_settings(settings)
     if engine == "envpool":

@@ -173,9 +173,7 @@ def frame_stack(k: int) -> Wrapper:
         return stacked, step._replace(obs=stacked, next_obs=next_obs)
 
     def spec(env_spec: EnvSpec) -> EnvSpec:
-        return env_spec._replace(
-            observation_space=map_space(lambda space: stacked_space(space, k), env_spec.observation_space), frames=k
-        )
+        return env_spec._replace(observation_space=map_space(lambda space: stacked_space(space, k), env_spec.observation_space), frames=k)
 
     return Wrapper("frame_stack", {"name": "frame_stack", "k": k}, spec, _no_statistics, init, step, learn_nothing)
 

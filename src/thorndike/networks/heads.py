@@ -25,12 +25,13 @@ class ActorCritic(nn.Module):
     hidden: Sequence[int]
     activation: str
     log_std_init: Number
+    cnn: str = "nature"
 
     @nn.compact
     def __call__(self, obs: Observation) -> tuple[Float[Array, "B P"], Float[Array, " B"]]:
         """Observation ``[B, ...]`` to policy parameters and value."""
         hidden_init = nn.initializers.orthogonal(2.0**0.5)
-        policy_torso = Torso(self.space, self.hidden, self.activation, hidden_init, name="policy_torso")
+        policy_torso = Torso(self.space, self.hidden, self.activation, hidden_init, cnn=self.cnn, name="policy_torso")
         features = policy_torso(obs)
         if is_image(self.space):
             value_features = features
@@ -113,12 +114,13 @@ class QValues(nn.Module):
     dueling: bool
     outputs: int = 1
     layer_norm: bool = False
+    cnn: str = "nature"
 
     @nn.compact
     def __call__(self, obs: Observation) -> Float[Array, "B A"]:
         """Observation ``[B, ...]`` to one value an action."""
         shared = self.hidden[:-1] if self.dueling else self.hidden
-        features = Torso(self.space, shared, self.activation, torch_uniform, self.layer_norm, name="torso")(obs)
+        features = Torso(self.space, shared, self.activation, torch_uniform, self.layer_norm, self.cnn, name="torso")(obs)
         if not self.dueling:
             return nn.Dense(self.actions * self.outputs, kernel_init=torch_uniform, name="q")(features)
         return combined(self._stream(features, 1, "value"), self._stream(features, self.actions, "advantage"))
@@ -138,10 +140,16 @@ def combined(value: Float[Array, "*B K"], advantage: Float[Array, "*B AK"]) -> F
 
 
 def actor_critic(
-    space: gymnasium.Space, outputs: int, free_parameters: int, hidden: Sequence[int], activation: str, log_std_init: Number = 0.0
+    space: gymnasium.Space,
+    outputs: int,
+    free_parameters: int,
+    hidden: Sequence[int],
+    activation: str,
+    log_std_init: Number = 0.0,
+    cnn: str = "nature",
 ) -> Network:
     """A policy and its value. ``outputs`` is ``P`` less the ``free_parameters`` that do not depend on the observation."""
-    return _pair(ActorCritic(space, outputs, free_parameters, tuple(hidden), activation, log_std_init))
+    return _pair(ActorCritic(space, outputs, free_parameters, tuple(hidden), activation, log_std_init, cnn))
 
 
 def q_values(
@@ -152,9 +160,10 @@ def q_values(
     dueling: bool = False,
     outputs: int = 1,
     layer_norm: bool = False,
+    cnn: str = "nature",
 ) -> Network:
     """Q-values of every action, or ``outputs`` numbers of each."""
-    return _pair(QValues(space, actions, tuple(hidden), activation, dueling, outputs, layer_norm))
+    return _pair(QValues(space, actions, tuple(hidden), activation, dueling, outputs, layer_norm, cnn))
 
 
 class Shape(NamedTuple):
@@ -167,6 +176,8 @@ class Shape(NamedTuple):
     memory_size: int = 64
     layer_norm: bool = False
     """Normalise each hidden layer before its activation; for Q-values without memory."""
+    cnn: str = "nature"
+    """The convolutions of images: see ``cnn.py``."""
 
 
 def policy_network(
@@ -177,7 +188,8 @@ def policy_network(
         return masked(given(spec, distribution.network_outputs + distribution.free_parameters), spec)
     outputs, free, hidden_init = distribution.network_outputs, distribution.free_parameters, nn.initializers.orthogonal(2.0**0.5)
     if shape.memory == "none":
-        return masked(actor_critic(spec.observation_space, outputs, free, shape.net_arch, shape.activation, log_std_init), spec)
+        network = actor_critic(spec.observation_space, outputs, free, shape.net_arch, shape.activation, log_std_init, shape.cnn)
+        return masked(network, spec)
     if is_image(spec.observation_space):
         return masked(_remembering(spec, shape, hidden_init, PolicyAndValue(outputs, free, log_std_init)), spec)
     # One memory for both would be shaped by the value's gradient, which is far larger: the policy then learns nothing (measured).
@@ -195,13 +207,13 @@ def q_outputs(spec: EnvSpec, actions: int, shape: Shape, dueling: bool, outputs:
     if given is not None:
         return given(spec, actions * outputs)
     if shape.memory == "none":
-        return q_values(spec.observation_space, actions, shape.net_arch, shape.activation, dueling, outputs, shape.layer_norm)
+        return q_values(spec.observation_space, actions, shape.net_arch, shape.activation, dueling, outputs, shape.layer_norm, shape.cnn)
     return _remembering(spec, shape, torch_uniform, QHead(actions, dueling, outputs))
 
 
 def _remembering(spec: EnvSpec, shape: Shape, kernel_init: Callable[..., Array], head: nn.Module) -> Network:
     return remembering(
-        Remembering(spec.observation_space, shape.net_arch, shape.activation, kernel_init, shape.memory, shape.memory_size, head)
+        Remembering(spec.observation_space, shape.net_arch, shape.activation, kernel_init, shape.memory, shape.memory_size, head, shape.cnn)
     )
 
 

@@ -101,6 +101,10 @@ class Settings(Protocol):
     def activation(self) -> str:
         """After each hidden layer."""
 
+    @property
+    def cnn(self) -> str:
+        """The convolutions of images."""
+
 
 class Priorities(NamedTuple):
     """See ``prioritized.py``."""
@@ -227,7 +231,7 @@ def build_parts(name: str, config: Settings, options: Options, spec: EnvSpec, ne
     refuse_what_does_not_go_together(name, options)
     memory = () if options.memory is None else options.memory[:2]
     form = Form(options.dueling, options.noisy_sigma, options.implicit)
-    shape = Shape(config.net_arch, config.activation, *memory)
+    shape = Shape(config.net_arch, config.activation, *memory)._replace(cnn=config.cnn)
     net = value_network(spec, int(spec.action_space.n), shape, form, options.distribution, network)
     if net.network.recurrence is not None and options.memory is None:
         raise UserError(f"{name}: the network given has a memory; say so by the setting memory, which sequences are sampled for")

@@ -96,7 +96,12 @@ def once_each(stacks: Stacks, ring: Ring, build: Callable[[Ring], Replay]) -> Re
 
 
 def _write(
-    replay: FrameReplay, stacks: Stacks, kept: int, obs: UInt8[Array, "B H W K"], next_obs: UInt8[Array, "B H W K"], valid: Bool[Array, " B"]
+    replay: FrameReplay,
+    stacks: Stacks,
+    kept: int,
+    obs: UInt8[Array, "B H W K"],
+    next_obs: UInt8[Array, "B H W K"],
+    valid: Bool[Array, " B"],
 ) -> tuple[FrameReplay, tuple[Int[Array, " B"], Int[Array, " B"]]]:
     """The frames of one step that are not there yet; the numbers of the newest frames of both observations."""
     num_envs, size = valid.shape[0], stacks.frames

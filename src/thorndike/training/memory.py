@@ -24,7 +24,9 @@ def check_memory(name: str, algorithm: Algorithm, seeds: int, buffer_size: int |
     needed = seeds * sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in jax.tree.leaves(state)) * (2 if twice else 1)
     free = available_memory()
     if free is not None and needed > free:
-        raise UserError(f"{name}: {_of(seeds)} needs {gigabytes(needed)}, {gigabytes(free)} are available; {_advice(buffer_size, free / needed, seeds)}")
+        raise UserError(
+            f"{name}: {_of(seeds)} needs {gigabytes(needed)}, {gigabytes(free)} are available; {_advice(buffer_size, free / needed, seeds)}"
+        )
     if needed >= WORTH_SAYING:
         beside = "" if free is None else f" of {gigabytes(free)} available"
         notice(f"{name}: {_of(seeds)} takes {gigabytes(needed)}{beside}")

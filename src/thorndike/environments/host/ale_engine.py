@@ -23,7 +23,6 @@ from thorndike.environments.host.atari import AtariSettings, episode_limit, rom_
 from thorndike.environments.host.steps import host_spec, host_step
 from thorndike.types import Step
 
-
 _NO_LIMIT = 2**31 - 1
 
 

@@ -13,7 +13,7 @@ Settings of Gymnasium's own (``obs_type``, ``mode``, ``difficulty``...) ask for 
 """
 
 from collections.abc import Mapping
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 from thorndike.errors import UserError
 from thorndike.suggestions import did_you_mean
@@ -62,14 +62,14 @@ def is_preprocessed(id: str, env_kwargs: Mapping[str, object]) -> bool:
 def atari_settings(env_kwargs: Mapping[str, object]) -> AtariSettings:
     """The protocol that is named (or ``machado``) with the settings given in its place. Raises UserError."""
     given = dict(env_kwargs)
-    protocol = given.pop("protocol", "machado")
+    protocol = str(given.pop("protocol", "machado"))
     if protocol not in PROTOCOLS:
-        raise UserError(f"no Atari protocol {protocol!r}{did_you_mean(str(protocol), PROTOCOLS)}; there are {', '.join(PROTOCOLS)}")
+        raise UserError(f"no Atari protocol {protocol!r}{did_you_mean(protocol, PROTOCOLS)}; there are {', '.join(PROTOCOLS)}")
     for name, value in given.items():
         kinds = KINDS[name]
         if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
             raise UserError(f"Atari's {name} must be of the kind {kinds[0].__name__}, not {value!r}")
-    settings = PROTOCOLS[cast(str, protocol)]._replace(**given)  # type: ignore[arg-type]
+    settings = PROTOCOLS[protocol]._replace(**given)  # type: ignore[arg-type]
     for name, least in _LEAST.items():
         if getattr(settings, name) < least:
             raise UserError(f"Atari's {name} must be at least {least}, not {getattr(settings, name)}")

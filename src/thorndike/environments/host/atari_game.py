@@ -26,10 +26,9 @@ def atari_game(id: str, settings: AtariSettings, max_episode_steps: int | None =
 class AtariGame(gymnasium.Env):
     """Observations ``uint8[H, W, stack]``, the newest frame last; older frames of a new game are black."""
 
-    metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 15}
-
     def __init__(self, id: str, settings: AtariSettings, render_mode: str | None = None) -> None:
         """Makes Gymnasium's environment of that id."""
+        self.metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 15}
         self._raw = gymnasium.make(
             id,
             frameskip=1,
@@ -61,7 +60,7 @@ class AtariGame(gymnasium.Env):
         self._lives = self._ale.lives()
         self._screens[0] = 0
         self._ale.getScreenGrayscale(self._screens[1])
-        black = np.zeros(self.observation_space.shape[:2], np.uint8)
+        black = np.zeros((self._settings.screen_size, self._settings.screen_size), np.uint8)
         self._frames.extend([black] * self._settings.stack_num)
         return self._seen(), {}
 
@@ -81,7 +80,8 @@ class AtariGame(gymnasium.Env):
 
     def render(self) -> np.ndarray | None:
         """The game's own picture ``uint8[210, 160, 3]``."""
-        return self._raw.render()
+        picture = self._raw.render()
+        return picture if isinstance(picture, np.ndarray) else None
 
     def close(self) -> None:
         """Ends the game."""
