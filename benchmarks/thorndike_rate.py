@@ -25,6 +25,9 @@ class Job(NamedTuple):
     num_envs: int | None
     settings: Mapping[str, object]
     engine: str = "auto"
+    env_kwargs: Mapping[str, object] | None = None
+    wrappers: tuple[str, ...] | None = None
+    """Names of wrappers without settings."""
 
 
 PPO: dict[str, object] = {
@@ -59,6 +62,16 @@ JOBS = {
     "dqn": Job("dqn", "CartPole-v1", 300_000, 10, DQN),
     "q_learning": Job("q_learning", "FrozenLake-v1", 2_000_000, 1, Q_LEARNING),
     "gymnasium": Job("ppo", "CartPole-v1", 102_400, 8, {**PPO, "batch_size": 256}, engine="gymnasium"),
+    "pong": Job(
+        "ppo",
+        "ALE/Pong-v5",
+        12_288,
+        8,
+        {**PPO, "batch_size": 256, "clip_range": 0.1, "net_arch": (512,), "activation": "relu"},
+        engine="ale",
+        env_kwargs={"protocol": "classic"},
+        wrappers=("clip_reward", "end_at_cost"),
+    ),
 }
 
 
@@ -91,6 +104,8 @@ def main() -> None:
     from thorndike import api
 
     import_cpu_s = cpu_seconds()
+    from thorndike.environments.wrappers import from_settings
+
     job = JOBS[options.task]
     with tempfile.TemporaryDirectory() as folder:
         result = api.train(
@@ -103,6 +118,8 @@ def main() -> None:
             settings=job.settings,
             preset="none",
             engine=job.engine,
+            env_kwargs=job.env_kwargs,
+            wrappers=None if job.wrappers is None else [from_settings([{"name": name} for name in job.wrappers])],
             device="cpu",
             output=folder,
         )

@@ -69,10 +69,11 @@ class AtariGame(gymnasium.Env):
         reward, chosen = 0.0, self._actions[int(action)]
         for left in range(self._settings.frameskip - 1, -1, -1):
             reward += self._ale.act(chosen)
+            if self._ale.game_over(with_truncation=False):
+                # ale-py's engine leaves the frames of a game that is over as they were.
+                break
             if left < 2:
                 self._ale.getScreenGrayscale(self._screens[1 - left])
-            if self._ale.game_over(with_truncation=False):
-                break
         over, lives = self._ale.game_over(with_truncation=False), self._ale.lives()
         lost, self._lives = lives < self._lives and not over, lives
         info = {"cost": 1.0} if lost and self._settings.terminal_on_life_loss else {}
