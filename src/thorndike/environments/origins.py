@@ -46,6 +46,16 @@ def missing_package(id: str) -> str | None:
         return f"{id} needs the Atari package: pip install 'thorndike[atari]'"
     if id.startswith("MinAtar/") and importlib.util.find_spec("minatar") is None:
         return f"{id} trains without it, but is evaluated and filmed on the package minatar: pip install 'thorndike[minatar]'"
+    return _missing_family(id)
+
+
+def _missing_family(id: str) -> str | None:
+    """The same for the families that Gymnasium registers whether their package is there or not."""
+    spec = gymnasium.registry.get(id)
+    where = str(spec.entry_point) if spec is not None else ""
+    for family, package in (("mujoco", "mujoco"), ("box2d", "Box2D")):
+        if where.startswith(f"gymnasium.envs.{family}") and importlib.util.find_spec(package) is None:
+            return f"{id} needs the package {package}: pip install 'thorndike[{family}]'"
     return None
 
 

@@ -28,7 +28,7 @@ from gymnasium import spaces
 
 from thorndike.environments.host.arrays import action_converter, check_seeds, check_spaces, fresh_copy, take, with_rows
 from thorndike.environments.host.checks import all_finite, finite_test, not_finite, reward_not_finite
-from thorndike.environments.host.faults import Fault, named, reset_name
+from thorndike.environments.host.faults import Fault, named, one_line, reset_name
 from thorndike.environments.host.steps import host_step
 from thorndike.errors import UserError
 from thorndike.types import EnvSpec, Observation, Step
@@ -214,9 +214,13 @@ def _pool_facts(id: str, env_kwargs: Mapping[str, object]) -> _Facts:
     import envpool
 
     settings = {name: value for name, value in env_kwargs.items() if name != "render_mode"}
-    with _no_narrowing_warnings():
-        spec = envpool.make_spec(id, **settings)
-        observation, action = spec.gymnasium_observation_space, spec.gymnasium_action_space
+    try:
+        with _no_narrowing_warnings():
+            spec = envpool.make_spec(id, **settings)
+            observation, action = spec.gymnasium_observation_space, spec.gymnasium_action_space
+    except ImportError as error:
+        # Some families need more than Python packages: Procgen Qt 5.
+        raise UserError(f"EnvPool cannot start {id} here: {one_line(error)}") from error
     players = getattr(spec.config, "max_num_players", 1)
     if players != 1:
         raise UserError(f"{id} has {players} players, and this engine steps one: choose an id with one player")
