@@ -79,17 +79,18 @@ def test_what_is_drawn_equals_what_a_memory_of_whole_stacks_draws(memories, fill
         held = [memory.add(state, rollout) for memory, state in zip(memories, held, strict=True)]
         if number % 5 == 2:
             draws = [memory.sample(state, jax.random.key(number), 0.5) for memory, state in zip(memories, held, strict=True)]
-            compare(*draws)
+            # With 25 steps an episode the oldest few may have lost their frames; the spare ones make up for most.
+            assert compare(*draws) >= 0.9
 
 
-def compare(plain, frames) -> None:
+def compare(plain, frames) -> float:
+    """Raises where the two differ; which share of the rows counts in both."""
     np.testing.assert_array_equal(plain.rows, frames.rows)
     np.testing.assert_array_equal(plain.importance, frames.importance)
     used = parts(plain.batch)[0] & parts(frames.batch)[0]
-    # With 25 steps an episode the oldest few may have lost their frames; the spare ones make up for most.
-    assert used.sum() >= 0.9 * parts(plain.batch)[0].sum()
     for ours, theirs in zip(parts(frames.batch)[1:], parts(plain.batch)[1:], strict=True):
         np.testing.assert_array_equal(ours[used], theirs[used])
+    return used.sum() / parts(plain.batch)[0].sum()
 
 
 def parts(batch) -> list[np.ndarray]:

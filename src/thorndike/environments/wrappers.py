@@ -219,10 +219,7 @@ def clip_reward(limit: float = 1.0) -> Wrapper:
 
 
 def end_at_cost() -> Wrapper:
-    """A step with a cost is the last of the learner's episode: the future after it is worth 0. The environment's own goes on.
-
-    With Atari's protocol ``classic`` the cost is a lost life: Mnih et al. 2015.
-    """
+    """A step with a cost (a lost life in Atari's ``classic``) ends the learner's episode, not the environment's: Mnih et al. 2015."""
 
     def step(statistics: PyTree, memory: PyTree, obs: Observation, action: Action, step: Step) -> tuple[PyTree, Step]:
         del statistics, obs, action

@@ -69,7 +69,7 @@ def atari_settings(env_kwargs: Mapping[str, object]) -> AtariSettings:
         kinds = KINDS[name]
         if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
             raise UserError(f"Atari's {name} must be of the kind {kinds[0].__name__}, not {value!r}")
-    settings = PROTOCOLS[protocol]._replace(**given)  # type: ignore[arg-type]
+    settings = AtariSettings._make(given.get(name, value) for name, value in PROTOCOLS[protocol]._asdict().items())
     for name, least in _LEAST.items():
         if getattr(settings, name) < least:
             raise UserError(f"Atari's {name} must be at least {least}, not {getattr(settings, name)}")

@@ -38,7 +38,7 @@ class AtariGame(gymnasium.Env):
             render_mode=render_mode,
             disable_env_checker=True,
         )
-        self._ale = self._raw.unwrapped.ale  # type: ignore[attr-defined]
+        self._ale = self._raw.get_wrapper_attr("ale")
         self._actions = self._ale.getLegalActionSet() if settings.full_action_space else self._ale.getMinimalActionSet()
         self._settings = settings
         height, width = self._ale.getScreenDims()
