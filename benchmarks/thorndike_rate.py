@@ -6,6 +6,7 @@ compiled) and the last one; what ``train`` itself says of the whole run is repor
 
 import argparse
 import json
+import math
 import sys
 import tempfile
 from collections.abc import Mapping
@@ -136,7 +137,8 @@ def main() -> None:
             "wall_s": result.wall_s,
             "cpu_s": result.cpu_s,
         },
-        mean_return=result.mean_return,
+        # JSON has no NaN, which a run is given in which no episode ended.
+        mean_return=None if math.isnan(result.mean_return) else result.mean_return,
     )
 
 

@@ -3,8 +3,8 @@
 There it is one matrix product over patches, in both directions. A kernel that its stride divides (8 by 4, 4 by 2) first turns blocks of
 pixels into channels, so that few and large pieces are moved. On an accelerator it is XLA's. Parameters are those of ``nn.Conv``.
 
-Mnih et al.'s network with a batch of 256 in such a loop, forward and with its gradient: 76 and 173 ms of one core; XLA's convolutions take
-101 and 4,245 ms, theirs forward with patches backward 109 and 251 ms (``benchmarks/convolutions.py``).
+Mnih et al.'s network with a batch of 256 in such a loop, with its gradient: 257 ms of one core; XLA's convolutions take 4,256 ms, theirs
+forward with patches backward 354 ms. Forward alone they are about equal: 158, 132 and 128 ms (``benchmarks/convolutions.py``).
 """
 
 from collections.abc import Callable
