@@ -150,6 +150,20 @@ TASKS = (
         )
     ),
     Task(
+        "pong",
+        "PPO on Pong",
+        "rate",
+        "no sticky actions, lost lives end episodes, rewards clipped (Thorndike: `ALE/Pong-v5`, protocol `classic`, engine `ale`; peers: "
+        "Stable-Baselines3's `make_atari_env`, DummyVecEnv), 8 games x 128 steps of 4 frames, 4 epochs of 4 minibatches of 256, the "
+        "network of Mnih et al. 2015, clip 0.1, the rest as in PPO above; a step is 4 frames",
+        (
+            thorndike("Thorndike", "pong"),
+            peer("SBX", "sbx_ppo_pong.py", note="policy and value have convolutions of their own: twice the work"),
+            peer("Stable-Baselines3", "sb3_ppo_pong.py"),
+        ),
+        (Claim("Thorndike", "Stable-Baselines3", 1.2), Claim("Thorndike", "SBX", 4)),
+    ),
+    Task(
         "threshold",
         "CartPole-v1 from process start to a mean return of 475",
         "threshold",

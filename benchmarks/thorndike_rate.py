@@ -6,6 +6,7 @@ compiled) and the last one; what ``train`` itself says of the whole run is repor
 
 import argparse
 import json
+import math
 import sys
 import tempfile
 from collections.abc import Mapping
@@ -27,6 +28,9 @@ class Job(NamedTuple):
     engine: str = "auto"
     flat: bool = False
     """Whether images go through a plain multilayer perceptron, as the peer's do."""
+    env_kwargs: Mapping[str, object] | None = None
+    wrappers: tuple[str, ...] | None = None
+    """Names of wrappers without settings."""
 
 
 PPO: dict[str, object] = {
@@ -76,6 +80,16 @@ JOBS = {
     "minatar_ppo": Job("ppo", "MinAtar/Breakout-v1", 409_600, 64, {**PPO, "batch_size": 2_048}, flat=True),
     "minatar_dqn": Job("dqn", "MinAtar/Breakout-v1", 200_000, 10, {**DQN, "net_arch": (64, 64)}, flat=True),
     "gymnasium": Job("ppo", "CartPole-v1", 102_400, 8, {**PPO, "batch_size": 256}, engine="gymnasium"),
+    "pong": Job(
+        "ppo",
+        "ALE/Pong-v5",
+        12_288,
+        8,
+        {**PPO, "batch_size": 256, "clip_range": 0.1, "net_arch": (512,), "activation": "relu"},
+        engine="ale",
+        env_kwargs={"protocol": "classic"},
+        wrappers=("clip_reward", "end_at_cost"),
+    ),
 }
 
 
@@ -128,6 +142,8 @@ def main() -> None:
     from thorndike import api
 
     import_cpu_s = cpu_seconds()
+    from thorndike.environments.wrappers import from_settings
+
     job = JOBS[options.task]
     with tempfile.TemporaryDirectory() as folder:
         result = api.train(
@@ -141,6 +157,8 @@ def main() -> None:
             preset="none",
             engine=job.engine,
             network=perceptron(job) if job.flat else None,
+            env_kwargs=job.env_kwargs,
+            wrappers=None if job.wrappers is None else [from_settings([{"name": name} for name in job.wrappers])],
             device="cpu",
             output=folder,
         )
@@ -157,7 +175,8 @@ def main() -> None:
             "wall_s": result.wall_s,
             "cpu_s": result.cpu_s,
         },
-        mean_return=result.mean_return,
+        # JSON has no NaN, which a run is given in which no episode ended.
+        mean_return=None if math.isnan(result.mean_return) else result.mean_return,
     )
 
 

@@ -13,6 +13,7 @@ PPO = {
     "max_grad_norm": 0.5,
 }
 PPO_GYMNASIUM = {**PPO, "batch_size": 256}
+PPO_PONG = {**PPO, "batch_size": 256, "clip_range": 0.1}
 DQN = {
     "learning_rate": 2.5e-4,
     "buffer_size": 10_000,

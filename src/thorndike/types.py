@@ -102,12 +102,14 @@ class EnvSpec(NamedTuple):
     num_envs: int
     max_episode_steps: int | None = None
     engine: str = "native"
-    """``native`` (compiled), ``gymnasium``, ``subprocess`` or ``envpool``."""
+    """``native`` (compiled), ``gymnasium``, ``subprocess``, ``envpool`` or ``ale``."""
     num_agents: int = 1
     can_vmap: bool = True
     can_restore: bool = True
     goal: Goal | None = None
     """For hindsight; None where there are no goals, or where no compiled program can judge them."""
+    frames: int = 1
+    """How many successive frames an observation holds on its last axis, the newest last: what replay then stores once."""
 
 
 class Environment(NamedTuple):

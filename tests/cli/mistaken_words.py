@@ -335,7 +335,7 @@ def no_number(chance: random.Random, place: Path) -> list[str]:
 
 def no_choice(chance: random.Random, place: Path) -> list[str]:
     flag, known = chance.choice(
-        [("--engine", ["auto", "native", "gymnasium", "subprocess", "envpool"]), ("--device", ["auto", "cpu", "gpu"])]
+        [("--engine", ["auto", "native", "gymnasium", "subprocess", "envpool", "ale"]), ("--device", ["auto", "cpu", "gpu"])]
     )
     if chance.random() < 0.2:
         return ["compare", "a", "b", "--metric", unlike(chance, lambda word: word in ("iqm", "mean"), ["iqm", "mean"])]

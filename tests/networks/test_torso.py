@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 from thorndike.errors import UserError
-from thorndike.networks.torso import CNN, MLP, SmallConvolution, Torso, flatten_observation, is_image, torch_uniform
+from thorndike.networks.cnn import CNN
+from thorndike.networks.convolution import Convolution, max_pool
+from thorndike.networks.torso import MLP, Torso, flatten_observation, is_image, torch_uniform
 from thorndike.training.space_files import space_from_json, space_to_json
 
 BATCH = 3
@@ -129,14 +131,45 @@ def test_the_dense_layers_after_convolutions_are_those_asked_for():
     assert {name: layers[name]["kernel"].shape for name in ("Dense_0", "Dense_1")} == {"Dense_0": (1024, 32), "Dense_1": (32, 8)}
 
 
-def test_the_convolution_of_small_images_is_flaxs():
-    image = jax.random.normal(jax.random.key(1), (5, 7, 10, 4))
-    mine = SmallConvolution(16, torch_uniform)
-    theirs = nn.Conv(16, (3, 3), padding="VALID", kernel_init=torch_uniform)
+@pytest.mark.parametrize(
+    ("size", "stride", "same", "batch"),
+    [(3, 1, False, 5), (4, 2, False, 5), (8, 4, False, 5), (3, 2, False, 5), (3, 1, True, 5), (4, 2, False, 515)],
+)
+def test_a_convolution_is_flaxs_forward_and_backward(size, stride, same, batch):
+    image = jax.random.normal(jax.random.key(1), (batch, 11, 14, 2))
+    mine = Convolution(6, size, stride, torch_uniform, same)
+    theirs = nn.Conv(6, (size, size), (stride, stride), padding="SAME" if same else "VALID", kernel_init=torch_uniform)
     variables = theirs.init(jax.random.key(0), image)
     assert jax.tree.all(jax.tree.map(np.array_equal, variables, mine.init(jax.random.key(0), image)))
-    variables["params"]["bias"] = jnp.arange(16.0)
-    np.testing.assert_allclose(mine.apply(variables, image), theirs.apply(variables, image), rtol=1e-4, atol=1e-4)
+    variables["params"]["bias"] = jnp.arange(6.0)
+    found, expected = (jax.vjp(module.apply, variables, image) for module in (mine, theirs))
+    np.testing.assert_allclose(found[0], expected[0], rtol=1e-4, atol=1e-4)
+    weight = jax.random.normal(jax.random.key(2), found[0].shape)
+    for ours, other in zip(jax.tree.leaves(found[1](weight)), jax.tree.leaves(expected[1](weight)), strict=True):
+        np.testing.assert_allclose(ours, other, rtol=1e-3, atol=1e-3 * batch**0.5)
+
+
+@pytest.mark.parametrize("shape", [(84, 84), (21, 10), (5, 4)])
+def test_the_maximum_of_windows_is_flaxs(shape):
+    image = jax.random.normal(jax.random.key(1), (2, *shape, 3))
+    np.testing.assert_array_equal(max_pool(image), nn.max_pool(image, (3, 3), (2, 2), padding="SAME"))
+
+
+def test_the_impala_network_has_fifteen_convolutions_and_adds_to_what_it_is_given():
+    module, image = CNN((256,), jax.nn.initializers.zeros, kind="impala"), jax.ShapeDtypeStruct((2, 84, 84, 4), jnp.float32)
+    features, variables = jax.eval_shape(lambda key, x: module.init_with_output(key, x), jax.random.key(0), image)
+    shapes = [layer["kernel"].shape for layer in variables["params"].values()]
+    assert features.shape == (2, 256)
+    expected = [(3, 3, a, b) for a, b in ((4, 16), *[(16, 16)] * 4, (16, 32), *[(32, 32)] * 9)]
+    assert sorted(shapes) == sorted([*expected, (11 * 11 * 32, 256)])
+
+
+def test_stacks_with_channels_first_reach_the_network_with_channels_last():
+    stack = jnp.asarray(np.random.default_rng(0).integers(0, 256, (2, 4, 40, 44)), jnp.uint8)
+    first, last = (Torso(spaces.Box(0, 255, shape, np.uint8), (8,), "relu", torch_uniform) for shape in ((4, 40, 44), (40, 44, 4)))
+    found, variables = first.init_with_output(jax.random.key(0), stack)
+    assert variables["params"]["CNN_0"]["Conv_0"]["kernel"].shape == (8, 8, 4, 32)
+    np.testing.assert_array_equal(last.apply(variables, jnp.moveaxis(stack, 1, -1)), found)
 
 
 def test_pixels_are_scaled_to_1_and_a_grey_image_gets_a_channel():

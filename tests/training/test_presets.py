@@ -23,7 +23,8 @@ SHIPPED = [
 @pytest.mark.parametrize(("algorithm", "environment", "preset"), SHIPPED, ids=[f"{a} {e} {p.name}" for a, e, p in SHIPPED])
 def test_a_shipped_preset_builds_its_learner(algorithm: str, environment: str, preset: Preset):
     """Its names, its bounds, its minibatches, its wrappers on its environment's spaces."""
-    choice = registry.resolve(environment)
+    environment = environment.replace("*", "Pong-v5")
+    choice = registry.resolve(environment, env_kwargs=preset.env_kwargs)
     known = {field.name for field in dataclasses.fields(importlib.import_module(ALGORITHMS[algorithm].module).Config)}
     assert set(preset.settings) <= known
     num_envs = preset.num_envs or 1

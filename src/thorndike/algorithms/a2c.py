@@ -28,6 +28,7 @@ from thorndike.functional.held_noise import with_held_noise
 from thorndike.functional.policy_losses import actor_critic_loss, explained_variance, standardize
 from thorndike.functional.returns import generalized_advantage
 from thorndike.functional.schedules import schedule
+from thorndike.networks.cnn import CNNS
 from thorndike.networks.heads import Shape, stochastic_policy
 from thorndike.networks.network import Network, NetworkBuilder, apply_rollout, apply_step, fresh_memory
 from thorndike.networks.recurrent import MEMORIES
@@ -52,6 +53,7 @@ class Config:
     normalize_advantage: bool = False  # standardise the rollout's advantages
     net_arch: tuple[int, ...] = (64, 64)  # widths of the hidden layers
     activation: Annotated[str, OneOf(*ACTIVATIONS)] = "tanh"  # after each hidden layer
+    cnn: Annotated[str, OneOf(*CNNS)] = "nature"  # convolutions of images
     action_distribution: Annotated[str, OneOf(*BOX_KINDS)] = "gaussian"  # of Box actions; gaussian: clipped to the bounds
     log_std_init: float = 0.0  # log standard deviation at the start (Box actions; beta has none)
     use_sde: bool = False  # gSDE: explore by noise that depends on the state, and is held
@@ -100,7 +102,7 @@ def a2c_loss(
 
 def a2c(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) -> Algorithm:
     """A2C for an environment. Raises ``UserError`` where the action space is not supported."""
-    shape = Shape(config.net_arch, config.activation, config.memory, config.memory_size)
+    shape = Shape(config.net_arch, config.activation, config.memory, config.memory_size, cnn=config.cnn)
     distribution, net = stochastic_policy(spec, shape, config.action_distribution, config.use_sde, config.log_std_init, network)
     optimizer = optax.chain(
         optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_rms(decay=0.99, eps=config.rms_prop_eps, eps_in_sqrt=False)

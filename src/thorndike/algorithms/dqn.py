@@ -24,6 +24,7 @@ from typing import Annotated
 from thorndike.errors import UserError
 from thorndike.functional.distributional import DISTRIBUTIONS, Support, return_distribution
 from thorndike.functional.value_loss import Munchausen
+from thorndike.networks.cnn import CNNS
 from thorndike.networks.network import NetworkBuilder
 from thorndike.networks.recurrent import MEMORIES
 from thorndike.networks.torso import ACTIVATIONS
@@ -79,6 +80,7 @@ class Config:
     sequence_length: Annotated[int, AtLeast(2)] = 16  # with memory: steps of a sampled sequence; a minibatch holds batch_size in all
     net_arch: tuple[int, ...] = (64, 64)  # widths of the hidden layers
     activation: Annotated[str, OneOf(*ACTIVATIONS)] = "relu"  # after each hidden layer
+    cnn: Annotated[str, OneOf(*CNNS)] = "nature"  # convolutions of images
 
     def __post_init__(self) -> None:
         check(self)

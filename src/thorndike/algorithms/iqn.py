@@ -17,6 +17,7 @@ from typing import Annotated
 
 from thorndike.functional.distributional import implicit_quantiles
 from thorndike.functional.value_loss import Munchausen
+from thorndike.networks.cnn import CNNS
 from thorndike.networks.network import NetworkBuilder
 from thorndike.networks.torso import ACTIVATIONS
 from thorndike.replay.deep_q import Options, Priorities, deep_q
@@ -56,6 +57,7 @@ class Config:
     munchausen_clip: float = -1.0  # l_0: the log-policy's lowest value
     net_arch: tuple[int, ...] = (64, 64)  # widths of the hidden layers
     activation: Annotated[str, OneOf(*ACTIVATIONS)] = "relu"  # after each hidden layer
+    cnn: Annotated[str, OneOf(*CNNS)] = "nature"  # convolutions of images
 
     def __post_init__(self) -> None:
         check(self)

@@ -1,7 +1,6 @@
 """Proximal policy optimisation (PPO), with the clipped surrogate.
 
-Schulman, Wolski, Dhariwal, Radford, Klimov 2017, "Proximal Policy Optimization Algorithms" (arXiv:1707.06347); advantages from Schulman et
-al. 2016 (arXiv:1506.02438). Deviations from the paper:
+Schulman et al. 2017, "Proximal Policy Optimization Algorithms" (arXiv:1707.06347); advantages: arXiv:1506.02438. Deviations from it:
 
 1. Advantages are standardised in each minibatch, gradients clipped by their global norm, weights orthogonal, as in OpenAI's PPO2.
 2. Policy and value have separate networks (one shared torso on images, and with memory, whose minibatches are whole sequences).
@@ -39,6 +38,7 @@ from thorndike.functional.policy_losses import (
 from thorndike.functional.returns import generalized_advantage
 from thorndike.functional.schedules import schedule
 from thorndike.functional.shuffling import minibatch_size, minibatches
+from thorndike.networks.cnn import CNNS
 from thorndike.networks.heads import Shape, stochastic_policy
 from thorndike.networks.network import Network, NetworkBuilder, apply_rollout, apply_step, as_rows, begins_episode, fresh_memory
 from thorndike.networks.recurrent import MEMORIES
@@ -67,6 +67,7 @@ class Config:
     normalize_advantage: bool = True  # standardise advantages in each minibatch
     net_arch: tuple[int, ...] = (64, 64)  # widths of the hidden layers
     activation: Annotated[str, OneOf(*ACTIVATIONS)] = "tanh"  # after each hidden layer
+    cnn: Annotated[str, OneOf(*CNNS)] = "nature"  # convolutions of images
     action_distribution: Annotated[str, OneOf(*BOX_KINDS)] = "gaussian"  # of Box actions; gaussian: clipped to the bounds
     log_std_init: float = 0.0  # log standard deviation at the start (Box actions; beta has none)
     use_sde: bool = False  # gSDE: explore by noise that depends on the state, and is held
@@ -191,7 +192,7 @@ def improve(
 
 def ppo(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) -> Algorithm:
     """PPO for an environment. Raises ``UserError`` where a rollout does not divide into minibatches or the space is not supported."""
-    shape = Shape(config.net_arch, config.activation, config.memory, config.memory_size)
+    shape = Shape(config.net_arch, config.activation, config.memory, config.memory_size, cnn=config.cnn)
     distribution, net = stochastic_policy(spec, shape, config.action_distribution, config.use_sde, config.log_std_init, network)
     rows, sequences = config.n_steps * spec.num_envs, net.recurrence is not None
     per_minibatch = minibatch_size("ppo", config.n_steps, spec.num_envs, config.batch_size, sequences)

@@ -32,6 +32,7 @@ from thorndike.functional.returns import lambda_return
 from thorndike.functional.schedules import Rate, schedule
 from thorndike.functional.shuffling import minibatch_size, minibatches
 from thorndike.functional.temporal_difference import select
+from thorndike.networks.cnn import CNNS
 from thorndike.networks.heads import Shape, q_network
 from thorndike.networks.masking import allowed, has_mask
 from thorndike.networks.network import Network, NetworkBuilder, as_rows, flattened
@@ -58,6 +59,7 @@ class Config:
     layer_norm: bool = True  # normalise each hidden layer
     net_arch: tuple[int, ...] = (128, 128)  # widths of the hidden layers
     activation: Annotated[str, OneOf(*ACTIVATIONS)] = "relu"  # after each hidden layer
+    cnn: Annotated[str, OneOf(*CNNS)] = "nature"  # convolutions of images
 
     def __post_init__(self) -> None:
         check(self)
@@ -130,7 +132,7 @@ def pqn(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) ->
     rows = config.n_steps * spec.num_envs
     per_minibatch = minibatch_size("pqn", config.n_steps, spec.num_envs, config.batch_size)
     example = example_observation(spec.observation_space)
-    shape = Shape(config.net_arch, config.activation, layer_norm=config.layer_norm)
+    shape = Shape(config.net_arch, config.activation, layer_norm=config.layer_norm, cnn=config.cnn)
     plain = q_network(spec, int(spec.action_space.n), shape, dueling=False, given=network)
     if plain.recurrence is not None:
         raise UserError("pqn has no memory: give a network without one, or use dqn with memory")

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from thorndike.functional.distributional import quantiles
+from thorndike.networks.cnn import CNNS
 from thorndike.networks.network import NetworkBuilder
 from thorndike.networks.torso import ACTIVATIONS
 from thorndike.replay.deep_q import Options, Priorities, deep_q
@@ -49,6 +50,7 @@ class Config:
     prioritized_beta0: Annotated[float, Between(0, 1)] = 0.4  # beta at the start: how far importance weights undo it; 1 at the end
     net_arch: tuple[int, ...] = (64, 64)  # widths of the hidden layers
     activation: Annotated[str, OneOf(*ACTIVATIONS)] = "relu"  # after each hidden layer
+    cnn: Annotated[str, OneOf(*CNNS)] = "nature"  # convolutions of images
 
     def __post_init__(self) -> None:
         check(self)

@@ -17,6 +17,7 @@ from typing import Annotated
 
 from thorndike.errors import UserError
 from thorndike.functional.distributional import Support, return_distribution
+from thorndike.networks.cnn import CNNS
 from thorndike.networks.network import NetworkBuilder
 from thorndike.networks.torso import ACTIVATIONS
 from thorndike.replay.deep_q import Options, Priorities, deep_q
@@ -54,6 +55,7 @@ class Config:
     adam_eps: Annotated[float, MoreThan(0)] = 1.5e-4  # Adam's epsilon
     net_arch: tuple[int, ...] = (64, 64)  # widths of the hidden layers
     activation: Annotated[str, OneOf(*ACTIVATIONS)] = "relu"  # after each hidden layer
+    cnn: Annotated[str, OneOf(*CNNS)] = "nature"  # convolutions of images
 
     def __post_init__(self) -> None:
         check(self)

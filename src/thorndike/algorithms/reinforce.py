@@ -29,6 +29,7 @@ from thorndike.functional.guards import accept_if, all_finite
 from thorndike.functional.policy_losses import explained_variance, standardize, weighted_mean
 from thorndike.functional.returns import generalized_advantage
 from thorndike.functional.schedules import schedule
+from thorndike.networks.cnn import CNNS
 from thorndike.networks.heads import Shape, stochastic_policy
 from thorndike.networks.network import Network, NetworkBuilder, apply_rollout, apply_step, fresh_memory
 from thorndike.networks.recurrent import MEMORIES
@@ -52,6 +53,7 @@ class Config:
     normalize_advantage: bool = True  # standardise the weights of a rollout's steps
     net_arch: tuple[int, ...] = (64, 64)  # widths of the hidden layers
     activation: Annotated[str, OneOf(*ACTIVATIONS)] = "tanh"  # after each hidden layer
+    cnn: Annotated[str, OneOf(*CNNS)] = "nature"  # convolutions of images
     action_distribution: Annotated[str, OneOf(*BOX_KINDS)] = "gaussian"  # of Box actions; gaussian: clipped to the bounds
     log_std_init: float = 0.0  # log standard deviation at the start (Box actions; beta has none)
     memory: Annotated[str, OneOf(*MEMORIES)] = "none"  # recurrent memory of the network
@@ -111,7 +113,7 @@ def reinforce(config: Config, spec: EnvSpec, network: NetworkBuilder | None = No
             f"reinforce without a baseline learns from whole episodes: n_steps {config.n_steps} must be at least the time limit {limit} of "
             f"{spec.id}; set n_steps={limit}, or baseline=true"
         )
-    shape = Shape(config.net_arch, config.activation, config.memory, config.memory_size)
+    shape = Shape(config.net_arch, config.activation, config.memory, config.memory_size, cnn=config.cnn)
     distribution, net = stochastic_policy(spec, shape, config.action_distribution, False, config.log_std_init, network)
     optimizer = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam(eps=1e-5))
     learning_rate, example = schedule(config.learning_rate), example_observation(spec.observation_space)

@@ -23,7 +23,8 @@ from thorndike.training.actor_threads import SCHEDULES, ActorThreads, threaded_s
 from thorndike.training.devices import devices_for
 from thorndike.training.host_source import HostEngine, HostSource, host_source
 from thorndike.training.json_files import TEXT, Kind, check_fields, whole
-from thorndike.training.presets import Preset
+from thorndike.training.memory import check_memory
+from thorndike.training.presets import Preset, find_preset
 from thorndike.training.runner import Runner, page_length, runner
 from thorndike.training.session import Plan
 from thorndike.training.sources import compiled_source
@@ -104,6 +105,23 @@ def make(
     if choice.engine == "native":
         return registry.build_native(choice, num_envs)
     return registry.build_host(choice, num_envs, env_timeout=env_timeout)
+
+
+def choose(
+    algorithm: str,
+    environment: EnvironmentLike,
+    preset: str | None,
+    engine: str = "auto",
+    env_kwargs: Mapping[str, object] | None = None,
+    max_episode_steps: int | None = None,
+) -> tuple[registry.Choice, Preset]:
+    """The environment that is meant, with the preset's own settings of it where none are given, and the preset. Raises ``UserError``."""
+    choice = registry.resolve(environment, engine=engine, env_kwargs=env_kwargs, max_episode_steps=max_episode_steps)
+    found = find_preset(algorithm, choice.id, preset)
+    if found.env_kwargs:
+        both = {**found.env_kwargs, **(env_kwargs or {})}
+        choice = registry.resolve(environment, engine=engine, env_kwargs=both, max_episode_steps=max_episode_steps)
+    return choice, found
 
 
 def check_algorithm(algorithm: str) -> None:
@@ -230,6 +248,15 @@ def build_job(
             env_timeout=env_timeout,
         )
         spec, source, algorithm, plan, close = _on_host(request, engine, wrapper, build, indices)
+    if not algorithm.needs.on_policy:
+        buffer_size = request.config.get("buffer_size")
+        check_memory(
+            request.algorithm,
+            algorithm,
+            len(indices),
+            buffer_size if isinstance(buffer_size, int) else None,
+            twice=choice.engine != "native" and len(indices) > 1,
+        )
     bound = runner(algorithm, source, request.seed, indices, devices_for(len(indices), devices))
     return Job(request, algorithm, wrapper, spec, source, bound, plan, close)
 

@@ -11,6 +11,7 @@ from thorndike.api.policy_files import read_policy
 from thorndike.api.recorded_run import refuse_code
 from thorndike.environments import registry
 from thorndike.environments.host.action_masks import mask_in_observation
+from thorndike.environments.host.atari import described
 from thorndike.environments.host.gymnasium_engine import LoopEngine
 from thorndike.environments.origins import limit_of
 from thorndike.errors import UserError
@@ -40,6 +41,11 @@ class LoadedPolicy:
     def run(self) -> Path | None:
         """The run's directory."""
         return self._policy.run
+
+    @property
+    def protocol(self) -> str | None:
+        """Of an Atari game: what it is trained and evaluated by, in words."""
+        return described(self.facts["environment"], self.facts["env_kwargs"])
 
     @property
     def seeds(self) -> Sequence["LoadedPolicy"]:

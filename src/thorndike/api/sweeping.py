@@ -13,7 +13,7 @@ import numpy as np
 
 from thorndike import startup
 from thorndike.algorithms import ALGORITHMS
-from thorndike.api.building import Request, check_algorithm, full_config, full_request, is_large, prepare_devices
+from thorndike.api.building import Request, check_algorithm, choose, full_config, full_request, is_large, prepare_devices
 from thorndike.api.loading import load
 from thorndike.api.recorded_run import refuse_code
 from thorndike.api.sweep_trials import Numbered, TrialRunner, batches, check_trials, group_trials, trials_at_once
@@ -27,7 +27,6 @@ from thorndike.training.evaluation import Evaluation
 from thorndike.training.json_files import Json, blamed_on
 from thorndike.training.machine import differences
 from thorndike.training.notices import notice
-from thorndike.training.presets import find_preset
 from thorndike.training.progress import Progress
 from thorndike.training.run_directory import facts, read_run, write_json
 from thorndike.training.run_lock import run_lock
@@ -139,10 +138,8 @@ def sweep(
         )
     if algorithm == "planning" or not isinstance(environment, str):
         raise UserError("a sweep trains a learner on an environment that a text names (an id, module:Id or path/to/file.py:ClassName)")
-    choice = registry.resolve(environment, engine=engine, env_kwargs=env_kwargs, max_episode_steps=max_episode_steps)
-    request = full_request(
-        algorithm, choice, find_preset(algorithm, choice.id, preset), None, settings or {}, steps, num_envs, seeds, seed, None
-    )
+    choice, found_preset = choose(algorithm, environment, preset, engine, env_kwargs, max_episode_steps)
+    request = full_request(algorithm, choice, found_preset, None, settings or {}, steps, num_envs, seeds, seed, None)
     request = request._replace(log_every=math.ceil(request.steps / LOG_POINTS))
     prepare_devices(choice, seeds)
     backend = startup.choose_device(device, is_large(algorithm, choice))

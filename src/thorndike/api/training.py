@@ -7,12 +7,21 @@ from contextlib import closing
 from pathlib import Path
 
 from thorndike import startup
-from thorndike.api.building import EnvironmentLike, Job, Request, build_job, check_algorithm, full_request, is_large, prepare_devices
+from thorndike.api.building import (
+    EnvironmentLike,
+    Job,
+    Request,
+    build_job,
+    check_algorithm,
+    choose,
+    full_request,
+    is_large,
+    prepare_devices,
+)
 from thorndike.api.exporting import export_policy
 from thorndike.api.planning import plan_run
 from thorndike.api.recorded_run import Objects, rebuild, request_in
 from thorndike.api.training_result import Result
-from thorndike.environments import registry
 from thorndike.errors import UserError
 from thorndike.networks.network import NetworkBuilder
 from thorndike.records import read_record
@@ -22,7 +31,6 @@ from thorndike.training.faults import locate
 from thorndike.training.json_files import Json
 from thorndike.training.metrics import last_points
 from thorndike.training.notices import notice
-from thorndike.training.presets import find_preset
 from thorndike.training.progress import Progress
 from thorndike.training.run_directory import checkpoints, facts, new_run_directory, truncate_lines, write_json
 from thorndike.training.run_lock import run_lock
@@ -71,10 +79,9 @@ def train(
     check_algorithm(algorithm)
     if not 0 <= seed < 2**32 or seeds < 1:
         raise UserError(f"a seed is a number from 0 to 2^32 - 1, and there is at least one; got seed={seed}, seeds={seeds}")
-    choice = registry.resolve(environment, engine=engine, env_kwargs=env_kwargs, max_episode_steps=max_episode_steps)
+    choice, found = choose(algorithm, environment, preset, engine, env_kwargs, max_episode_steps)
     if algorithm == "planning":
         return plan_run(choice, settings or {}, output, name, command)
-    found = find_preset(algorithm, choice.id, preset)
     actors = ActorThreads(actor_threads, actor_schedule, env_restarts)
     request = full_request(algorithm, choice, found, wrappers, settings or {}, steps, num_envs, seeds, seed, checkpoint_every, actors)
     prepare_devices(choice, seeds, devices)

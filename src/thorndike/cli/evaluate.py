@@ -28,12 +28,12 @@ def run(words: Sequence[str]) -> Answer:
     from_policy(directory, read_policy_facts)
     from thorndike.api import load
 
-    found = load(directory).evaluate(
-        episodes=options.episodes, seed=options.seed, num_envs=options.num_envs, deterministic=not options.stochastic
-    )
+    policy = load(directory)
+    found = policy.evaluate(episodes=options.episodes, seed=options.seed, num_envs=options.num_envs, deterministic=not options.stochastic)
     data = {
         "run": found.run,
         "environment": found.environment,
+        "protocol": policy.protocol,
         "episodes": found.episodes,
         "mean": found.mean,
         "iqm": found.iqm,
@@ -43,8 +43,9 @@ def run(words: Sequence[str]) -> Answer:
     }
     low, high = found.ci95
     whose = "the only seed" if len(found.per_seed) == 1 else f"each of {len(found.per_seed)} seeds"
+    protocol = "" if policy.protocol is None else f" ({policy.protocol})"
     text = (
-        f"{found.environment}, {found.episodes:,} episodes of {whose}\n"
+        f"{found.environment}{protocol}, {found.episodes:,} episodes of {whose}\n"
         f"mean {found.mean:.4g} (95 % interval {low:.4g} to {high:.4g}), interquartile mean {found.iqm:.4g}, worst seed {found.min:.4g}\n"
         f"per seed: {', '.join(f'{value:.4g}' for value in found.per_seed)}"
     )

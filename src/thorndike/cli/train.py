@@ -23,7 +23,7 @@ from thorndike.suggestions import did_you_mean
 if TYPE_CHECKING:
     from thorndike.api import Result
 
-ENGINES = ("auto", "native", "gymnasium", "subprocess", "envpool")
+ENGINES = ("auto", "native", "gymnasium", "subprocess", "envpool", "ale")
 DEVICES = ("auto", "cpu", "gpu")
 
 EXAMPLES = """\

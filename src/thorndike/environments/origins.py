@@ -18,6 +18,7 @@ import gymnasium
 from gymnasium.vector import VectorEnv
 from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 
+from thorndike.environments.host.atari import atari_settings, is_preprocessed
 from thorndike.errors import UserError
 
 Settings: TypeAlias = Mapping[str, object]
@@ -32,7 +33,10 @@ def is_known_id(name: str) -> bool:
     if module:
         _import(module, name)
     elif id.startswith("ALE/") and importlib.util.find_spec("ale_py") is not None:
-        gymnasium.register_envs(importlib.import_module("ale_py"))
+        package = importlib.import_module("ale_py")
+        gymnasium.register_envs(package)
+        # It greets on stderr otherwise, once for each game.
+        package.ALEInterface.setLoggerMode(package.LoggerMode.Error)
     elif id.startswith("MinAtar/") and id not in gymnasium.registry and importlib.util.find_spec("minatar") is not None:
         # Not by itself when Gymnasium starts: it brings Matplotlib, Seaborn and pandas.
         importlib.import_module("minatar.gym").register_envs()
@@ -53,12 +57,19 @@ def missing_package(id: str) -> str | None:
         return f"{id} trains without it, but is evaluated and filmed on the package minatar: pip install 'thorndike[minatar]'"
     if id.startswith(_ROBOTICS) and id not in gymnasium.registry and importlib.util.find_spec("gymnasium_robotics") is None:
         return f"{id} needs the robotics package: pip install 'thorndike[robotics]'"
+    return _missing_family(id)
+
+
+def _missing_family(id: str) -> str | None:
+    """The same for the families that Gymnasium registers whether their package is there or not."""
     spec = gymnasium.registry.get(id)
-    robot = spec is not None and str(spec.entry_point).startswith(
-        ("gymnasium_robotics.envs.fetch", "gymnasium_robotics.envs.shadow_dexterous")
-    )
+    where = str(spec.entry_point) if spec is not None else ""
+    robot = where.startswith(("gymnasium_robotics.envs.fetch", "gymnasium_robotics.envs.shadow_dexterous"))
     if robot and int(importlib.metadata.version("mujoco").partition(".")[0]) >= 4:
         return f"{id} does not start on mujoco 4 (gymnasium-robotics 1.4.2 cannot read its joints there): pip install 'mujoco<4'"
+    for family, package in (("mujoco", "mujoco"), ("box2d", "Box2D")):
+        if where.startswith(f"gymnasium.envs.{family}") and importlib.util.find_spec(package) is None:
+            return f"{id} needs the package {package}: pip install 'thorndike[{family}]'"
     return None
 
 
@@ -112,6 +123,11 @@ def limit_of(environment: gymnasium.Env) -> int | None:
     return min((limit for limit in limits if limit is not None), default=None)
 
 
+def frames_of(environment: gymnasium.Env) -> int:
+    """How many successive frames an observation holds on its last axis, where the environment says so by ``frames_stacked``."""
+    return int(getattr(environment.unwrapped, "frames_stacked", 1))
+
+
 def class_in_file(name: str) -> tuple[Path, str] | None:
     """The parts of ``path/to/file.py:ClassName``, or None if `name` has not that form."""
     path, _, attribute = name.rpartition(":")
@@ -128,6 +144,10 @@ def _from_name(name: str, env_kwargs: Settings, max_episode_steps: int | None, r
     missing = missing_package(id)
     if missing is not None:
         raise UserError(missing)
+    if is_preprocessed(id, env_kwargs) and id in gymnasium.registry:
+        from thorndike.environments.host.atari_game import atari_game
+
+        return atari_game(id, atari_settings(env_kwargs), max_episode_steps, render_mode)
     settings = dict(env_kwargs)
     if render_mode is not None:
         settings["render_mode"] = render_mode

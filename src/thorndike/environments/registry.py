@@ -6,7 +6,8 @@ The order, with ``engine="auto"``:
    (``unwrapped.P``) around which nothing but Gymnasium's own checks and time limit is wrapped.
 2. ``envpool``: an id that means the same task in EnvPool and Gymnasium (``host/envpool_ids.py`` says how that was found), or that only
    EnvPool has, where EnvPool is installed. Ids that both have but that were not found equal stay with Gymnasium.
-3. ``gymnasium``: everything else. ``subprocess`` is chosen by hand, for environments slow enough to pay for the processes.
+3. ``ale``: an Atari game (``ALE/...``), preprocessed as ``host/atari.py`` says; the same on ``envpool``, ``gymnasium`` and ``subprocess``.
+4. ``gymnasium``: everything else. ``subprocess`` is chosen by hand, for environments slow enough to pay for the processes.
 
 Nothing heavy is imported at the top: a wrong id is rejected before JAX is.
 """
@@ -17,6 +18,7 @@ from functools import partial
 from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
+from thorndike.environments.host.atari import PREFIX, atari_settings, episode_limit, is_preprocessed, pool_id, pool_settings
 from thorndike.environments.host.envpool_ids import SAME_AS_GYMNASIUM, pool_ids, pool_is_installed
 from thorndike.environments.native import NATIVE, factory, is_only_native, settings_of
 from thorndike.errors import UserError
@@ -26,6 +28,7 @@ if TYPE_CHECKING:
     import gymnasium
     from gymnasium.vector import VectorEnv
 
+    from thorndike.environments.host.ale_engine import AleEngine
     from thorndike.environments.host.envpool_engine import EnvPoolEngine
     from thorndike.environments.host.gymnasium_engine import LoopEngine
     from thorndike.environments.host.subprocess_engine import SubprocessEngine
@@ -33,10 +36,10 @@ if TYPE_CHECKING:
     from thorndike.environments.native.vectorize import Dynamics
     from thorndike.types import Environment
 
-    HostEngine: TypeAlias = LoopEngine | SubprocessEngine | VectorEngine | EnvPoolEngine
+    HostEngine: TypeAlias = LoopEngine | SubprocessEngine | VectorEngine | EnvPoolEngine | AleEngine
     Named: TypeAlias = str | gymnasium.Env | Callable[..., gymnasium.Env] | VectorEnv | Environment | Dynamics
 
-ENGINES = ("auto", "native", "gymnasium", "subprocess", "envpool")
+ENGINES = ("auto", "native", "gymnasium", "subprocess", "envpool", "ale")
 NO_SETTINGS: Mapping[str, object] = MappingProxyType({})
 
 
@@ -46,7 +49,7 @@ class Choice(NamedTuple):
     id: str
     """What the run is called by and, where a string was given, rebuilt from."""
     engine: str
-    """``native``, ``gymnasium``, ``subprocess`` or ``envpool``."""
+    """``native``, ``gymnasium``, ``subprocess``, ``envpool`` or ``ale``."""
     origin: "Named"
     env_kwargs: Mapping[str, object]
     max_episode_steps: int | None
@@ -102,27 +105,35 @@ def build_host(choice: Choice, num_envs: int, masks: bool = False, env_timeout: 
     from thorndike.environments.host.gymnasium_engine import LoopEngine
     from thorndike.environments.host.subprocess_engine import SubprocessEngine
     from thorndike.environments.host.vector_engine import VectorEngine
-    from thorndike.environments.origins import VectorEnv, limit_of, make_single
+    from thorndike.environments.origins import VectorEnv, frames_of, limit_of, make_single
 
     if choice.engine == "native":
         raise UserError(f"{choice.id} runs on the native engine, which is compiled: build it with build_native")
     if choice.engine == "envpool":
         return _build_pool(choice, num_envs)
+    if choice.engine == "ale":
+        from thorndike.environments.host.ale_engine import AleEngine
+
+        return AleEngine(choice.id, num_envs, atari_settings(choice.env_kwargs), choice.max_episode_steps)
     if isinstance(choice.origin, VectorEnv):
         if choice.origin.num_envs != num_envs:
             raise UserError(f"{choice.id} is a vector of {choice.origin.num_envs} environments, not {num_envs}: set num_envs to that")
         return VectorEngine(choice.origin, choice.id, timeouts=timeouts(env_timeout))
     make: Callable[..., gymnasium.Env] = partial(make_single, choice.origin, choice.env_kwargs, choice.max_episode_steps)
     probe = make()
-    limit = limit_of(probe)
+    limit, frames = limit_of(probe), frames_of(probe)
     probe.close()
     if masks:
         from thorndike.environments.host.action_masks import mask_in_observation
 
         make = mask_in_observation(make)
+    engine: HostEngine
     if choice.engine == "subprocess":
-        return SubprocessEngine([make] * num_envs, choice.id, limit, timeouts(env_timeout))
-    return LoopEngine([make] * num_envs, choice.id, limit)
+        engine = SubprocessEngine([make] * num_envs, choice.id, limit, timeouts(env_timeout))
+    else:
+        engine = LoopEngine([make] * num_envs, choice.id, limit)
+    engine.spec = engine.spec._replace(frames=frames)
+    return engine
 
 
 def reference(choice: Choice, render_mode: str | None = None) -> "gymnasium.Env":
@@ -167,6 +178,10 @@ def _engine_of_name(name: str, engine: str, settings: dict[str, object]) -> str:
     """The engine of an id; raises UserError if nobody has it or the engine asked for does not."""
     if engine in ("auto", "native") and name in NATIVE and _accepts(name, settings):
         return "native"
+    if name.startswith(PREFIX):
+        return _engine_of_atari(name, engine, settings)
+    if engine == "ale":
+        raise UserError(f"engine='ale' runs Atari games, whose ids begin with {PREFIX}, not {name}: use engine='auto'")
     if engine == "envpool":
         _check_pool(name)
         return "envpool"
@@ -180,6 +195,22 @@ def _engine_of_name(name: str, engine: str, settings: dict[str, object]) -> str:
         _check_pool(name)
         return "envpool"
     raise UserError(_unknown(name, engine))
+
+
+def _engine_of_atari(name: str, engine: str, settings: dict[str, object]) -> str:
+    """``ale`` unless another is asked for; ``gymnasium`` for the raw game, which settings of Gymnasium's own ask for."""
+    if not _gymnasium_has(name) or engine == "native":
+        raise UserError(_unknown(name, engine))
+    if not is_preprocessed(name, settings):
+        if engine in ("ale", "envpool"):
+            raise UserError(
+                f"{name} with {sorted(settings)} is the raw game, which engine={engine!r} does not have: use engine='gymnasium'"
+            )
+        return "gymnasium" if engine == "auto" else engine
+    atari_settings(settings)
+    if engine == "envpool":
+        _check_pool(pool_id(name))
+    return "ale" if engine == "auto" else engine
 
 
 def _resolve_object(environment: "Named", engine: str, settings: dict[str, object], max_episode_steps: int | None) -> Choice:
@@ -196,8 +227,8 @@ def _resolve_object(environment: "Named", engine: str, settings: dict[str, objec
         if engine not in ("auto", "gymnasium") or settings or max_episode_steps is not None:
             raise UserError("a VectorEnv is built already: give engine, env_kwargs and max_episode_steps where it is built")
         return Choice(name_of(environment), "gymnasium", environment, settings, None)
-    if engine == "envpool":
-        raise UserError("engine='envpool' needs an id of EnvPool, not an object: use engine='gymnasium' or 'subprocess'")
+    if engine in ("envpool", "ale"):
+        raise UserError(f"engine={engine!r} needs an id of its own, not an object: use engine='gymnasium' or 'subprocess'")
     chosen = _host_or_table(environment, engine, settings)
     return Choice(name_of(environment), chosen, environment, settings, max_episode_steps)
 
@@ -241,6 +272,17 @@ def _build_pool(choice: Choice, num_envs: int) -> "EnvPoolEngine":
     from thorndike.environments.host.envpool_engine import EnvPoolEngine
     from thorndike.environments.origins import make_single
 
+    if choice.id.startswith(PREFIX):
+        settings = atari_settings(choice.env_kwargs)
+        limit = episode_limit(settings, choice.max_episode_steps)
+        return EnvPoolEngine(
+            choice.id,
+            num_envs,
+            max_episode_steps=limit,
+            env_kwargs=pool_settings(settings),
+            pool_id=pool_id(choice.id),
+            tells_lives=settings.terminal_on_life_loss,
+        )
     facts = make_single(choice.id, NO_SETTINGS) if _gymnasium_has(choice.id) else None
     engine = EnvPoolEngine(choice.id, num_envs, reference=facts, max_episode_steps=choice.max_episode_steps, env_kwargs=choice.env_kwargs)
     if facts is not None:

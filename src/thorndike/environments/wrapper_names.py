@@ -17,8 +17,10 @@ _WRAPPERS, _NOVELTY = "thorndike.environments.wrappers", "thorndike.environments
 MODULES: Mapping[str, str] = MappingProxyType(
     {
         "centre_reward": _WRAPPERS,
+        "clip_reward": _WRAPPERS,
         "count_bonus": _NOVELTY,
         "discretise": _WRAPPERS,
+        "end_at_cost": _WRAPPERS,
         "frame_stack": _WRAPPERS,
         "normalize_observation": _WRAPPERS,
         "normalize_reward": _WRAPPERS,

@@ -173,7 +173,7 @@ def frame_stack(k: int) -> Wrapper:
         return stacked, step._replace(obs=stacked, next_obs=next_obs)
 
     def spec(env_spec: EnvSpec) -> EnvSpec:
-        return env_spec._replace(observation_space=map_space(lambda space: stacked_space(space, k), env_spec.observation_space))
+        return env_spec._replace(observation_space=map_space(lambda space: stacked_space(space, k), env_spec.observation_space), frames=k)
 
     return Wrapper("frame_stack", {"name": "frame_stack", "k": k}, spec, _no_statistics, init, step, learn_nothing)
 
@@ -203,6 +203,29 @@ def shape_reward(function: Callable[[Observation, Action, Step], Batch]) -> Wrap
         return memory, step._replace(reward=jnp.where(step.valid, function(obs, action, step), 0.0))
 
     return Wrapper("shape_reward", {}, _same_spec, _no_statistics, _init_nothing, step, learn_nothing)
+
+
+def clip_reward(limit: float = 1.0) -> Wrapper:
+    """Rewards clipped to [-limit, limit], as Mnih et al. 2015 did: episode returns and evaluation see the environment's own."""
+    if limit <= 0:
+        raise UserError(f"clip_reward needs a limit above 0, not {limit}: 1 is usual for Atari")
+
+    def step(statistics: PyTree, memory: PyTree, obs: Observation, action: Action, step: Step) -> tuple[PyTree, Step]:
+        del statistics, obs, action
+        return memory, step._replace(reward=jnp.clip(step.reward, -limit, limit))
+
+    settings = {"name": "clip_reward", "limit": limit}
+    return Wrapper("clip_reward", settings, _same_spec, _no_statistics, _init_nothing, step, learn_nothing)
+
+
+def end_at_cost() -> Wrapper:
+    """A step with a cost (a lost life in Atari's ``classic``) ends the learner's episode, not the environment's: Mnih et al. 2015."""
+
+    def step(statistics: PyTree, memory: PyTree, obs: Observation, action: Action, step: Step) -> tuple[PyTree, Step]:
+        del statistics, obs, action
+        return memory, step._replace(terminated=step.terminated | (step.valid & (step.cost > 0)))
+
+    return Wrapper("end_at_cost", {"name": "end_at_cost"}, _same_spec, _no_statistics, _init_nothing, step, learn_nothing)
 
 
 def centre_reward(weight: float, dimensions: Sequence[int], limits: Sequence[float]) -> Wrapper:

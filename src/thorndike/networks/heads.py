@@ -30,12 +30,13 @@ class ActorCritic(nn.Module):
     activation: str
     log_std_init: Number
     state_dependent: bool = False
+    cnn: str = "nature"
 
     @nn.compact
     def __call__(self, obs: Observation) -> tuple[Float[Array, "B P"], Float[Array, " B"]]:
         """Observation ``[B, ...]`` to policy parameters and value."""
         hidden_init = nn.initializers.orthogonal(2.0**0.5)
-        policy_torso = Torso(self.space, self.hidden, self.activation, hidden_init, name="policy_torso")
+        policy_torso = Torso(self.space, self.hidden, self.activation, hidden_init, cnn=self.cnn, name="policy_torso")
         features = policy_torso(obs)
         if is_image(self.space):
             value_features = features
@@ -128,12 +129,13 @@ class QValues(nn.Module):
     dueling: bool
     outputs: int = 1
     layer_norm: bool = False
+    cnn: str = "nature"
 
     @nn.compact
     def __call__(self, obs: Observation) -> Float[Array, "B A"]:
         """Observation ``[B, ...]`` to one value an action."""
         shared = self.hidden[:-1] if self.dueling else self.hidden
-        features = Torso(self.space, shared, self.activation, torch_uniform, self.layer_norm, name="torso")(obs)
+        features = Torso(self.space, shared, self.activation, torch_uniform, self.layer_norm, self.cnn, name="torso")(obs)
         if not self.dueling:
             return dense(self.actions * self.outputs, torch_uniform, name="q")(features)
         return combined(self._stream(features, 1, "value"), self._stream(features, self.actions, "advantage"))
@@ -160,9 +162,10 @@ def actor_critic(
     activation: str,
     log_std_init: Number = 0.0,
     state_dependent: bool = False,
+    cnn: str = "nature",
 ) -> Network:
     """A policy and its value. ``outputs`` is what the network computes of ``P``: see ``policy_parameters``."""
-    return _pair(ActorCritic(space, outputs, free_parameters, tuple(hidden), activation, log_std_init, state_dependent))
+    return _pair(ActorCritic(space, outputs, free_parameters, tuple(hidden), activation, log_std_init, state_dependent, cnn))
 
 
 def q_values(
@@ -173,9 +176,10 @@ def q_values(
     dueling: bool = False,
     outputs: int = 1,
     layer_norm: bool = False,
+    cnn: str = "nature",
 ) -> Network:
     """Q-values of every action, or ``outputs`` numbers of each."""
-    return _pair(QValues(space, actions, tuple(hidden), activation, dueling, outputs, layer_norm))
+    return _pair(QValues(space, actions, tuple(hidden), activation, dueling, outputs, layer_norm, cnn))
 
 
 class Shape(NamedTuple):
@@ -188,6 +192,8 @@ class Shape(NamedTuple):
     memory_size: int = 64
     layer_norm: bool = False
     """Normalise each hidden layer before its activation; for Q-values without memory."""
+    cnn: str = "nature"
+    """The convolutions of images: see ``cnn.py``."""
 
 
 def policy_network(
@@ -204,7 +210,8 @@ def policy_network(
     hidden_init = nn.initializers.orthogonal(2.0**0.5)
     outputs, free, smooth = distribution.network_outputs, distribution.free_parameters, distribution.features > 0
     if shape.memory == "none":
-        return masked(actor_critic(spec.observation_space, outputs, free, shape.net_arch, shape.activation, log_std_init, smooth), spec)
+        form = (outputs, free, shape.net_arch, shape.activation, log_std_init, smooth, shape.cnn)
+        return masked(actor_critic(spec.observation_space, *form), spec)
     if is_image(spec.observation_space):
         return masked(_remembering(spec, shape, hidden_init, PolicyAndValue(outputs, free, log_std_init, smooth)), spec)
     # One memory for both would be shaped by the value's gradient, which is far larger: the policy then learns nothing (measured).
@@ -236,13 +243,13 @@ def q_outputs(spec: EnvSpec, actions: int, shape: Shape, dueling: bool, outputs:
     if given is not None:
         return given(spec, actions * outputs)
     if shape.memory == "none":
-        return q_values(spec.observation_space, actions, shape.net_arch, shape.activation, dueling, outputs, shape.layer_norm)
+        return q_values(spec.observation_space, actions, shape.net_arch, shape.activation, dueling, outputs, shape.layer_norm, shape.cnn)
     return _remembering(spec, shape, torch_uniform, QHead(actions, dueling, outputs))
 
 
 def _remembering(spec: EnvSpec, shape: Shape, kernel_init: Callable[..., Array], head: nn.Module) -> Network:
     return remembering(
-        Remembering(spec.observation_space, shape.net_arch, shape.activation, kernel_init, shape.memory, shape.memory_size, head)
+        Remembering(spec.observation_space, shape.net_arch, shape.activation, kernel_init, shape.memory, shape.memory_size, head, shape.cnn)
     )
 
 

@@ -28,11 +28,12 @@ class ImplicitQuantiles(nn.Module):
     hidden: Sequence[int]
     activation: str
     dueling: bool
+    cnn: str = "nature"
 
     @nn.compact
     def __call__(self, obs: Observation, fractions: Float[Array, "B N"]) -> Float[Array, "B A N"]:
         """Observation, quantile levels in [0, 1] to the return of every action at these levels."""
-        features = Torso(self.space, self.hidden[:-1], self.activation, torch_uniform, name="torso")(obs)
+        features = Torso(self.space, self.hidden[:-1], self.activation, torch_uniform, cnn=self.cnn, name="torso")(obs)
         waves = jnp.cos(jnp.pi * jnp.arange(COSINES, dtype=jnp.float32)[None, None, :] * fractions[:, :, None])
         embedding = ACTIVATIONS[self.activation](nn.Dense(features.shape[-1], kernel_init=torch_uniform, name="levels")(waves))
         mixed = features[:, None, :] * embedding
@@ -45,9 +46,11 @@ class ImplicitQuantiles(nn.Module):
         return MLP(self.hidden[-1:], self.activation, torch_uniform, outputs=outputs, name=name)(mixed)
 
 
-def implicit_network(space: gymnasium.Space, actions: int, hidden: Sequence[int], activation: str, dueling: bool) -> Network:
+def implicit_network(
+    space: gymnasium.Space, actions: int, hidden: Sequence[int], activation: str, dueling: bool, cnn: str = "nature"
+) -> Network:
     """The network of pairs ``(obs, fractions)``."""
-    module = ImplicitQuantiles(space, actions, tuple(hidden), activation, dueling)
+    module = ImplicitQuantiles(space, actions, tuple(hidden), activation, dueling, cnn)
     return Network(
         init=lambda key, seen: module.init(key, *seen)["params"],
         apply=lambda params, seen: module.apply({"params": params}, *seen),

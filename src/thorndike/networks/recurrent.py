@@ -88,10 +88,11 @@ class Remembering(nn.Module):
     cell: str
     size: int
     head: nn.Module
+    cnn: str = "nature"
 
     def setup(self) -> None:
         """The parts that are shared by the methods."""
-        self.torso = Torso(self.space, self.hidden, self.activation, self.kernel_init)
+        self.torso = Torso(self.space, self.hidden, self.activation, self.kernel_init, cnn=self.cnn)
         self.recurrent = CELLS[self.cell](self.size)
 
     def __call__(self, memory: PyTree, obs: Observation) -> tuple[PyTree, PyTree]:

@@ -10,12 +10,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from thorndike.errors import UserError
+from thorndike.networks.cnn import CNN
 from thorndike.networks.dense import dense
 from thorndike.networks.masking import observed, without_mask
 from thorndike.types import Observation
-
-LARGE_IMAGE = 36
-"""Pixels of the shorter side from which Mnih et al.'s three convolutions fit."""
 
 ACTIVATIONS: dict[str, Callable[[Array], Array]] = {"tanh": nn.tanh, "relu": nn.relu, "gelu": nn.gelu, "silu": nn.silu}
 
@@ -45,59 +43,6 @@ class MLP(nn.Module):
         return dense(self.outputs, self.output_init or self.kernel_init)(x)
 
 
-class SmallConvolution(nn.Module):
-    """A 3 x 3 convolution without padding, with the parameters of ``nn.Conv``, as one matrix product over patches.
-
-    In a compiled loop on a CPU, XLA's own convolution takes 1.4 s for the gradient of 2,048 MinAtar boards, this 0.06 s, and 2.1 ms and
-    0.8 ms for 32 (one core, the dense layer of 128 included).
-    """
-
-    channels: int
-    kernel_init: Callable[..., Array]
-
-    @nn.compact
-    def __call__(self, image: Float[Array, "B H W C"]) -> Float[Array, "B H2 W2 D"]:
-        """Image to ``channels`` numbers at every place but the border."""
-        size, height, width, depth = 3, image.shape[1] - 2, image.shape[2] - 2, image.shape[3]
-        kernel = self.param("kernel", self.kernel_init, (size, size, depth, self.channels))
-        bias = self.param("bias", nn.initializers.zeros_init(), (self.channels,))
-        shifted = [image[:, i : i + height, j : j + width] for i in range(size) for j in range(size)]
-        patches = jnp.concatenate(shifted, axis=-1).reshape(-1, size * size * depth)
-        found = patches @ kernel.reshape(size * size * depth, self.channels) + bias[None]
-        return found.reshape(image.shape[0], height, width, self.channels)
-
-
-class CNN(nn.Module):
-    """Convolutions over an image ``[B, H, W, C]`` (NHWC), then dense layers, with ReLU after each.
-
-    Large images (36 pixels and more) get the three layers of Mnih et al. 2015, small ones the 3 x 3 layer with 16 channels of Young and
-    Tian 2019 (arXiv:1903.03176), who put a dense layer of 128 after it.
-    """
-
-    hidden: Sequence[int]
-    kernel_init: Callable[..., Array]
-    layer_norm: bool = False
-
-    @nn.compact
-    def __call__(self, image: Float[Array, "B H W C"]) -> Float[Array, "B F"]:
-        """Images in [0, 1] to features."""
-        x = image
-        if min(image.shape[1:3]) < LARGE_IMAGE:
-            # The name keeps the parameters where nn.Conv would have them.
-            x = self._activated(SmallConvolution(16, self.kernel_init, name="Conv_0")(x))
-        else:
-            for channels, size, stride in ((32, 8, 4), (64, 4, 2), (64, 3, 1)):
-                convolution = nn.Conv(channels, (size, size), (stride, stride), padding="VALID", kernel_init=self.kernel_init)
-                x = self._activated(convolution(x))
-        x = x.reshape((x.shape[0], -1))
-        for width in self.hidden:
-            x = self._activated(dense(width, self.kernel_init)(x))
-        return x
-
-    def _activated(self, x: Float[Array, "*B F"]) -> Float[Array, "*B F"]:
-        return nn.relu(nn.LayerNorm()(x) if self.layer_norm else x)
-
-
 class Torso(nn.Module):
     """Features of an observation: images through a CNN, everything else flattened, then the hidden layers."""
 
@@ -106,6 +51,8 @@ class Torso(nn.Module):
     activation: str
     kernel_init: Callable[..., Array]
     layer_norm: bool = False
+    cnn: str = "nature"
+    """Which convolutions: see ``cnn.py``."""
 
     @nn.compact
     def __call__(self, obs: Observation) -> Float[Array, "B G"]:
@@ -115,8 +62,10 @@ class Torso(nn.Module):
             return MLP(self.hidden, self.activation, self.kernel_init, layer_norm=self.layer_norm)(flatten_observation(space, obs))
         # A trailing axis turns a grey image [B, H, W] into [B, H, W, 1].
         image = obs if obs.ndim == 4 else obs[..., None]
+        if is_channels_first(space):
+            image = jnp.moveaxis(image, 1, -1)
         scaled = image.astype(jnp.float32) / (255.0 if image.dtype == jnp.uint8 else 1.0)
-        return CNN(self.hidden or (128,), self.kernel_init, self.layer_norm)(scaled)
+        return CNN(self.hidden or (128,), self.kernel_init, self.layer_norm, self.cnn)(scaled)
 
 
 def example_observation(space: gymnasium.Space) -> Observation:
@@ -130,6 +79,12 @@ def is_image(space: gymnasium.Space) -> bool:
     if not isinstance(space, gymnasium.spaces.Box):
         return False
     return len(space.shape) == 3 or (len(space.shape) == 2 and space.dtype == np.uint8)
+
+
+def is_channels_first(space: gymnasium.Space) -> bool:
+    """Whether an image is stored as channels, height, width: few in front of a larger picture, as in Gymnasium's stacks of frames."""
+    shape = space.shape or ()
+    return len(shape) == 3 and shape[0] <= 16 < min(shape[1:])
 
 
 def flatten_observation(space: gymnasium.Space, obs: Observation) -> Float[Array, "*B F"]:

@@ -111,7 +111,7 @@ def _implicit(
 ) -> ValueNetwork:
     if given is not None or shape.memory != "none":
         raise UserError("implicit quantiles come with their own network, without memory: leave the network and memory as they are")
-    plain = implicit_network(spec.observation_space, actions, shape.net_arch, shape.activation, form.dueling)
+    plain = implicit_network(spec.observation_space, actions, shape.net_arch, shape.activation, form.dueling, shape.cnn)
     example = (example_observation(spec.observation_space), jnp.zeros((1, outputs)))
 
     def apply(weights: PyTree, obs: Observation) -> PyTree:

@@ -21,6 +21,7 @@ from thorndike.networks.heads import Shape
 from thorndike.networks.masking import allowed, has_mask
 from thorndike.networks.network import NetworkBuilder, apply_step, fresh_memory
 from thorndike.networks.value_network import Form, value_network
+from thorndike.replay.frames import once_each, stacks_of
 from thorndike.replay.hindsight import Hindsight, replay_for
 from thorndike.replay.pace import Pace, pace
 from thorndike.replay.replay import Replay, Ring, prioritized_replay, sequence_replay, uniform_replay
@@ -100,6 +101,10 @@ class Settings(Protocol):
     @property
     def activation(self) -> str:
         """After each hidden layer."""
+
+    @property
+    def cnn(self) -> str:
+        """The convolutions of images."""
 
 
 class Priorities(NamedTuple):
@@ -236,14 +241,19 @@ def build_parts(name: str, config: Settings, options: Options, spec: EnvSpec, ne
     refuse_what_does_not_go_together(name, options)
     memory = () if options.memory is None else options.memory[:2]
     form = Form(options.dueling, options.noisy_sigma, options.implicit)
-    shape = Shape(config.net_arch, config.activation, *memory)
+    shape = Shape(config.net_arch, config.activation, *memory)._replace(cnn=config.cnn)
     net = value_network(spec, int(spec.action_space.n), shape, form, options.distribution, network)
     if net.network.recurrence is not None and options.memory is None:
         raise UserError(f"{name}: the network given has a memory; say so by the setting memory, which sequences are sampled for")
     ring = Ring(row_shapes(spec, fresh_memory(net.network, 1)), plan_of(name, config, options, spec.num_envs).ring_steps, spec.num_envs)
     optimizer = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam(eps=config.adam_eps))
     rule = Rule(options.distribution, options.double, options.munchausen)
-    return Parts(net, rule, _replay(config, options, ring, spec), optimizer, config.gamma)
+    stacks = stacks_of(spec)
+
+    def build(ring: Ring) -> Replay:
+        return _replay(config, options, ring, spec)
+
+    return Parts(net, rule, build(ring) if stacks is None else once_each(stacks, ring, build), optimizer, config.gamma)
 
 
 def _replay(config: Settings, options: Options, ring: Ring, spec: EnvSpec) -> Replay:

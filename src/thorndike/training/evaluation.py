@@ -86,7 +86,7 @@ def _play(policy: Policy, pool: Pool, each: int, seed: int, deterministic: bool)
             played[s, e] += 1
             total[s, e], age[s, e] = 0.0, 0
         wrapper_memory, step = moves.see(policy.statistics, wrapper_memory, obs, decision.engine_action, raw)
-        memory = moves.forget(raw.done | ~raw.valid, decision.memory)
+        memory = moves.forget(step.done | ~step.valid, decision.memory)
         obs, seen, t = raw.obs, step.obs, t + 1
         # The greedy policy ignores its noise; drawing it anew each step would only cost time.
         noise = noise if deterministic else noise_of(np.int32(t))

@@ -189,7 +189,8 @@ class Rolling:
                 wrapper_memory, step = moves.see(statistics, wrapper_memory, obs, decision.engine_action, raw)
                 self.rows.append(Rollout(seen, decision.action, decision.extras, step, ()))
                 self.tally.add(raw)
-                memory = moves.forget(raw.done | ~raw.valid, decision.memory)
+                # The learner's episode, which a wrapper may end before the environment's.
+                memory = moves.forget(step.done | ~step.valid, decision.memory)
                 obs, seen = raw.obs, step.obs
         finally:
             self.state = self.state._replace(

@@ -1,12 +1,16 @@
-"""Measured settings per environment, kept as TOML beside the code: ``presets/<algorithm>.toml``."""
+"""Settings per environment, kept as TOML beside the code: ``presets/<algorithm>.toml``. ``result`` says what they were measured to give.
+
+A name may be a pattern such as ``ALE/*``, for environments without an entry of their own.
+"""
 
 import tomllib
+from fnmatch import fnmatchcase
 from importlib import resources
 from typing import NamedTuple
 
 from thorndike.errors import UserError
 
-_PARTS = {"steps", "num_envs", "settings", "wrappers", "result", "max_episode_steps"}
+_PARTS = {"steps", "num_envs", "settings", "wrappers", "result", "max_episode_steps", "env_kwargs"}
 
 
 class Preset(NamedTuple):
@@ -17,9 +21,10 @@ class Preset(NamedTuple):
     num_envs: int | None
     settings: dict[str, object]
     wrappers: tuple[dict[str, object], ...]
+    env_kwargs: dict[str, object]
 
 
-EMPTY = Preset("defaults", None, None, {}, ())
+EMPTY = Preset("defaults", None, None, {}, (), {})
 
 
 def load_presets(algorithm: str) -> dict[str, dict[str, Preset]]:
@@ -38,13 +43,19 @@ def find_preset(algorithm: str, environment: str, name: str | None = None) -> Pr
     """
     if name == "none":
         return EMPTY
-    variants = load_presets(algorithm).get(environment, {})
+    variants = _variants_for(environment, load_presets(algorithm))
     if name is None:
         return variants.get("default", EMPTY)
     if name not in variants:
         known = ", ".join(sorted(variants)) or "there are none"
         raise UserError(f"no preset {name!r} of {algorithm} for {environment}; known: {known}")
     return variants[name]
+
+
+def _variants_for(environment: str, presets: dict[str, dict[str, Preset]]) -> dict[str, Preset]:
+    if environment in presets:
+        return presets[environment]
+    return next((variants for pattern, variants in presets.items() if fnmatchcase(environment, pattern)), {})
 
 
 def _variants(entry: dict) -> dict[str, Preset]:
@@ -54,4 +65,5 @@ def _variants(entry: dict) -> dict[str, Preset]:
 
 
 def _preset(name: str, entry: dict) -> Preset:
-    return Preset(name, entry.get("steps"), entry.get("num_envs"), dict(entry.get("settings", {})), tuple(entry.get("wrappers", ())))
+    settings, env_kwargs = dict(entry.get("settings", {})), dict(entry.get("env_kwargs", {}))
+    return Preset(name, entry.get("steps"), entry.get("num_envs"), settings, tuple(entry.get("wrappers", ())), env_kwargs)

@@ -268,6 +268,15 @@ def _stacked(algorithm: Algorithm, learn: Callable) -> _Learners:
     )
 
 
+def _alone(algorithm: Algorithm, learn: Callable) -> _Learners:
+    """One seed: its axis is taken off inside the program, so that not even a moment's copy is made of a replay of gigabytes."""
+
+    def one(*arguments: PyTree) -> PyTree:
+        return jax.tree.map(lambda x: x[None], learn(*jax.tree.map(lambda x: x.reshape(x.shape[1:]), arguments)))
+
+    return _stacked(algorithm, learn)._replace(learn=jax.jit(one, donate_argnums=0))
+
+
 def _apart(algorithm: Algorithm, learn: Callable) -> _Learners:
     """A learner a seed. XLA would copy the replay out of a stack and into it again at every iteration (SAC with 1,000,000 transitions)."""
     actor = jax.jit(algorithm.actor)
@@ -290,8 +299,8 @@ def _host_segment(
 ) -> Callable[[Carry, int, int], tuple[Carry, Report]]:
     """The same iterations, stepped from Python."""
     page = page_length(algorithm, source.spec.num_envs)
-    held_apart = jax.default_backend() == "cpu" and not algorithm.needs.on_policy
-    learners = (_apart if held_apart else _stacked)(algorithm, learn)
+    on_cpu, replays = jax.default_backend() == "cpu", not algorithm.needs.on_policy
+    stacked, alone, apart = (hold(algorithm, learn) for hold in (_stacked, _alone, _apart))
 
     def prepare(loop_key: Key[Array, ""], iteration: Int[Array, ""]) -> tuple[PyTree, Key[Array, ""]]:
         keys = _page_keys(loop_key, iteration // page)
@@ -302,6 +311,8 @@ def _host_segment(
     seen: list[bool] = []
 
     def run(carry: Carry, first: int, count: int) -> tuple[Carry, Report]:
+        few = alone if carry.loop_key.shape[0] == 1 else apart
+        learners = few if on_cpu and replays else stacked
         held, state, loop_keys = learners.take(carry.learner), carry.source, carry.loop_key
         reports: list[Report] = []
         for iteration in range(first, first + count):

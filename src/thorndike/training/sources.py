@@ -146,7 +146,8 @@ def compiled_source(environment: Environment, algorithm: Algorithm, wrapper: Wra
             jnp.where(done, steps, 0).astype(jnp.float32),
         )
         if jax.tree.leaves(memory):
-            memory = where_done(done, algorithm.memory(spec.num_envs), memory)
+            # The learner's episode, which a wrapper may end before the environment's.
+            memory = where_done(step.done, algorithm.memory(spec.num_envs), memory)
         following = SourceState(
             inner, raw.obs, step.obs, memory, wrapper_memory, state.statistics, jnp.where(done, 0.0, total), jnp.where(done, 0, steps)
         )

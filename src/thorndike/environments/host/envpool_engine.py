@@ -28,7 +28,7 @@ from gymnasium import spaces
 
 from thorndike.environments.host.arrays import action_converter, check_seeds, check_spaces, fresh_copy, take, with_rows
 from thorndike.environments.host.checks import all_finite, finite_test, not_finite, reward_not_finite
-from thorndike.environments.host.faults import Fault, named, reset_name
+from thorndike.environments.host.faults import Fault, named, one_line, reset_name
 from thorndike.environments.host.steps import host_step
 from thorndike.errors import UserError
 from thorndike.types import EnvSpec, Observation, Step
@@ -51,23 +51,28 @@ class EnvPoolEngine:
         max_episode_steps: int | None = None,
         env_kwargs: Mapping[str, object] = NO_SETTINGS,
         num_threads: int | None = None,
+        pool_id: str | None = None,
+        tells_lives: bool = False,
     ) -> None:
         """Describes the pool; it is made by ``reset``, because its seeds are fixed then.
 
         `reference` is Gymnasium's environment of that id, where there is one: its spaces and its limit are taken. `num_threads` defaults to
-        the number of cores this process may use. Raises UserError for an id with several players or spaces no learner can be shown.
+        the number of cores this process may use. `pool_id` is EnvPool's own name, where it is another; with `tells_lives` a lost life of
+        an Atari game is its step's cost. Raises UserError for an id with several players or spaces no learner can be shown.
         """
-        own = _pool_facts(id, env_kwargs)
+        self._pool_id = pool_id or id
+        own = _pool_facts(self._pool_id, env_kwargs)
         shown = own if reference is None else _shown(own, reference)
         observation, action = shown.observation, shown.action
         check_spaces(observation, action, id)
         limit = shown.limit if max_episode_steps is None else max_episode_steps
-        self.spec = EnvSpec(id, observation, action, num_envs, limit, "envpool", can_vmap=False, can_restore=False)
+        self.spec = EnvSpec(id, observation, action, num_envs, limit, "envpool", can_vmap=False, can_restore=False, frames=own.frames)
         self._limit = None if reference is None else limit
         self._settings = dict(env_kwargs)
         if limit is not None:
             self._settings["max_episode_steps"] = limit if self._limit is None else limit + 1
         self._channels_first = own.channels_first
+        self._tells_lives = tells_lives
         self._convert = action_converter(action)
         self._is_finite = finite_test(observation)
         self._steps = 0
@@ -85,10 +90,10 @@ class EnvPoolEngine:
         self._clock = np.zeros(self.spec.num_envs, np.int64)
         with _no_narrowing_warnings():
             pool = envpool.make_gymnasium(
-                self.spec.id, num_envs=self.spec.num_envs, seed=seeds, num_threads=self._threads, **self._settings
+                self._pool_id, num_envs=self.spec.num_envs, seed=seeds, num_threads=self._threads, **self._settings
             )
-            observation, _ = pool.reset()
-        self._pool = pool
+            observation, info = pool.reset()
+        self._pool, self._lives = pool, np.array(info.get("lives", 0))
         obs = self._observed(observation)
         self._check_finite(obs, reset_name(self._steps))
         return obs
@@ -106,7 +111,7 @@ class EnvPoolEngine:
         # From here a row that EnvPool itself ended is dead in the next step; one that the limit below ends is not.
         self._ended = terminated | truncated
         obs, truncated = self._keep_limit(next_obs, terminated, truncated, valid)
-        cost = np.where(valid, info.get("cost", 0), 0).astype(np.float32)
+        cost = np.where(valid, self._lost(info) if self._tells_lives else info.get("cost", 0), 0).astype(np.float32)
         reward = np.where(valid, reward, 0).astype(np.float32)
         self._check_finite(next_obs, f"step {self._steps}")
         if not all_finite(reward):
@@ -137,6 +142,12 @@ class EnvPoolEngine:
             return next_obs, truncated
         fresh, _ = self._running_pool().reset(cut)
         return with_rows(next_obs, cut, self._observed(fresh)), truncated
+
+    def _lost(self, info: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Which games lost a life and went on."""
+        lost = (info["lives"] < self._lives) & ~self._ended
+        self._lives = info["lives"].copy()
+        return lost
 
     def _check_finite(self, obs: Observation, when: str) -> None:
         if not self._is_finite(obs):
@@ -196,22 +207,30 @@ class _Facts(NamedTuple):
     action: gymnasium.Space
     limit: int | None
     channels_first: bool
+    frames: int
 
 
 def _pool_facts(id: str, env_kwargs: Mapping[str, object]) -> _Facts:
     import envpool
 
     settings = {name: value for name, value in env_kwargs.items() if name != "render_mode"}
-    with _no_narrowing_warnings():
-        spec = envpool.make_spec(id, **settings)
-        observation, action = spec.gymnasium_observation_space, spec.gymnasium_action_space
+    try:
+        with _no_narrowing_warnings():
+            spec = envpool.make_spec(id, **settings)
+            observation, action = spec.gymnasium_observation_space, spec.gymnasium_action_space
+    except ImportError as error:
+        # Some families need more than Python packages: Procgen Qt 5.
+        raise UserError(f"EnvPool cannot start {id} here: {one_line(error)}") from error
     players = getattr(spec.config, "max_num_players", 1)
     if players != 1:
         raise UserError(f"{id} has {players} players, and this engine steps one: choose an id with one player")
     channels_first = _is_channels_first(observation)
     if channels_first:
         observation = spaces.Box(0, 255, (*observation.shape[1:], observation.shape[0]), np.uint8)
-    return _Facts(_mended(observation), _mended(action), getattr(spec.config, "max_episode_steps", None), channels_first)
+    # Only of grey frames does the last axis hold nothing else.
+    stacked = channels_first and getattr(spec.config, "gray_scale", False)
+    frames = getattr(spec.config, "stack_num", 1) if stacked else 1
+    return _Facts(_mended(observation), _mended(action), getattr(spec.config, "max_episode_steps", None), channels_first, frames)
 
 
 @contextmanager

@@ -1,0 +1,14 @@
+"""SBX PPO on Pong, the settings of task ``pong``: NatureCNN, 8 games in one process (DummyVecEnv)."""
+
+from measurement import cpu_seconds
+from sb3_atari import NUM_ENVS, pong
+from sb3_window import measure, parse
+from sbx import PPO
+from settings import PPO_PONG as SETTINGS
+
+if __name__ == "__main__":
+    options = parse(default_steps=1_024)
+    import_cpu_s = cpu_seconds()
+    env = pong(options.seed)
+    model = PPO("CnnPolicy", env, seed=options.seed, device="cpu", policy_kwargs={"net_arch": {"pi": [], "vf": []}}, **SETTINGS)
+    measure(model, options.steps, warm_up=NUM_ENVS * 128, import_cpu_s=import_cpu_s)
