@@ -14,6 +14,7 @@ from thorndike.training.json_files import (
     OBJECT,
     OBJECTS,
     TEXT,
+    TEXTS,
     Json,
     Kind,
     blamed_on,
@@ -54,6 +55,7 @@ _OF_RUN: Mapping[str, Kind] = {
     "device": TEXT,
     "processors": TEXT,
 }
+_OF_OFFLINE: Mapping[str, Kind] = {"dataset": optional(TEXTS), "start_from": optional(TEXT)}
 _OF_POLICY: Mapping[str, Kind] = {**_SHARED, "observation_space": OBJECT, "action_space": OBJECT, "best": whole(0, _MOST)}
 
 
@@ -64,6 +66,7 @@ def read_record(run: Path) -> Json:
     if record["algorithm"] == "planning":
         raise UserError(f"{run} is a plan: it is complete, there is nothing to go on with; `thorndike train planning` plans again")
     check_fields(record, _OF_RUN, where)
+    check_fields({name: record.get(name) for name in _OF_OFFLINE}, _OF_OFFLINE, where)
     _check_learner(record, where)
     return record
 

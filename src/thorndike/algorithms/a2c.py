@@ -26,7 +26,7 @@ from thorndike.functional.guards import accept_if, all_finite
 from thorndike.functional.policy_losses import explained_variance, standardize, weighted_mean
 from thorndike.functional.returns import generalized_advantage
 from thorndike.functional.schedules import schedule
-from thorndike.networks.heads import Shape, policy_network
+from thorndike.networks.heads import Shape, policy_network, softmax_probabilities
 from thorndike.networks.network import Network, NetworkBuilder, apply_rollout, apply_step, fresh_memory
 from thorndike.networks.recurrent import MEMORIES
 from thorndike.networks.torso import ACTIVATIONS, example_observation
@@ -138,4 +138,5 @@ def a2c(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) ->
         update=update,
         observe=lambda state, rollout, key: (state, {}),
         needs=Needs(rollout_length=config.n_steps, on_policy=True),
+        probabilities=softmax_probabilities(net, spec.action_space),
     )

@@ -38,7 +38,7 @@ from thorndike.functional.policy_losses import (
 from thorndike.functional.returns import generalized_advantage
 from thorndike.functional.schedules import schedule
 from thorndike.functional.shuffling import minibatches
-from thorndike.networks.heads import Shape, policy_network
+from thorndike.networks.heads import Shape, policy_network, softmax_probabilities
 from thorndike.networks.network import Network, NetworkBuilder, apply_rollout, apply_step, as_rows, begins_episode, fresh_memory
 from thorndike.networks.recurrent import MEMORIES
 from thorndike.networks.torso import ACTIVATIONS, example_observation
@@ -246,4 +246,5 @@ def ppo(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) ->
         update=update,
         observe=lambda state, rollout, key: (state, {}),
         needs=Needs(rollout_length=config.n_steps, on_policy=True),
+        probabilities=softmax_probabilities(net, spec.action_space),
     )

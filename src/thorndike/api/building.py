@@ -16,6 +16,8 @@ from thorndike.errors import UserError
 from thorndike.networks.network import NetworkBuilder
 from thorndike.networks.torso import is_image
 from thorndike.suggestions import did_you_mean
+from thorndike.training.dataset_source import ENGINE, dataset_source, dataset_spec
+from thorndike.training.datasets import Dataset, read_dataset
 from thorndike.training.host_source import HostEngine, HostSource, host_source
 from thorndike.training.presets import Preset
 from thorndike.training.runner import Runner, page_length, runner
@@ -52,6 +54,10 @@ class Request(NamedTuple):
     num_envs: int
     log_every: int
     checkpoint_every: int
+    dataset: dict[str, str] | None = None
+    """``path`` and ``sha256`` of what is learnt from, where no environment is stepped; an update is then a step."""
+    start_from: str | None = None
+    """The offline run whose networks and dataset it began with."""
 
 
 class Lanes(NamedTuple):
@@ -145,6 +151,8 @@ def full_request(
     seeds: int,
     seed: int,
     checkpoint_every: int | None,
+    data: Dataset | None = None,
+    start_from: str | None = None,
 ) -> Request:
     """What was asked for, and what the preset and the defaults add to it."""
     steps = steps or preset.steps or DEFAULT_STEPS
@@ -153,16 +161,18 @@ def full_request(
         environment=choice.id,
         env_kwargs=dict(choice.env_kwargs),
         max_episode_steps=choice.max_episode_steps,
-        engine=choice.engine,
+        engine=choice.engine if data is None else ENGINE,
         config=full_config(algorithm, {**preset.settings, **settings, "total_steps": steps}),
         wrappers=list(preset.wrappers) if given is None else [wrapper.settings for wrapper in given],
         preset=preset.name,
         steps=steps,
         seeds=seeds,
         seed=seed,
-        num_envs=num_envs or preset.num_envs or ALGORITHMS[algorithm].num_envs,
+        num_envs=1 if data is not None else num_envs or preset.num_envs or ALGORITHMS[algorithm].num_envs,
         log_every=math.ceil(steps / LOG_POINTS),
         checkpoint_every=checkpoint_every or math.ceil(steps / CHECKPOINTS),
+        dataset=None if data is None else {"path": str(data.path.absolute()), "sha256": data.sha256},
+        start_from=start_from,
     )
 
 
@@ -175,6 +185,8 @@ def build_job(
     lanes: Lanes | None = None,
 ) -> Job:
     """Bind a request to its environment, learner, source and runner; ``lanes`` are other agents than its seeds, with their own learner."""
+    if request.dataset is not None:
+        return _offline_job(request, network)
     wrapper = wrappers.from_settings(request.wrappers) if given is None else wrappers.chain(*given)
     indices = range(request.seeds) if lanes is None else lanes.agents
     build = partial(build_algorithm, request.algorithm, request.config, network=network) if lanes is None else lanes.build
@@ -192,6 +204,22 @@ def build_job(
         source = host_source(engine, algorithm, wrapper, request.seed, indices, plan.checkpoint_every)
     bound = runner(algorithm, source, request.seed, indices)
     return Job(request, algorithm, wrapper, spec, source, bound, plan, close)
+
+
+def recorded_data(dataset: Mapping[str, str]) -> Dataset:
+    """The dataset that a request names. Raises ``UserError`` if it is not what it was."""
+    data = read_dataset(dataset["path"])
+    if data.sha256 != dataset["sha256"]:
+        raise UserError(f"{data.path} was changed since the run began; put it back, or train a new run on it")
+    return data
+
+
+def _offline_job(request: Request, network: NetworkBuilder | None) -> Job:
+    data, wrapper = recorded_data(request.dataset or {}), wrappers.chain()
+    spec = dataset_spec(data)
+    algorithm, plan = _learner(request, spec, wrapper, partial(build_algorithm, request.algorithm, request.config, network=network))
+    source = dataset_source(data, algorithm)
+    return Job(request, algorithm, wrapper, spec, source, runner(algorithm, source, request.seed, range(request.seeds)), plan, _nothing)
 
 
 def is_large(request_algorithm: str, choice: registry.Choice) -> bool:
@@ -216,7 +244,7 @@ def _learner(request: Request, spec: EnvSpec, wrapper: Wrapper, build: Callable[
     page = page_length(algorithm, request.num_envs)
     if plan.log_every > page:
         plan = plan._replace(log_every=math.ceil(plan.log_every / page) * page)
-    if request.engine != "native":
+    if request.engine not in ("native", ENGINE):
         # Host environments start afresh at checkpoints; a run ends at one, so that a longer run passes through the same states.
         plan = plan._replace(iterations=math.ceil(plan.iterations / plan.checkpoint_every) * plan.checkpoint_every)
     return algorithm, plan

@@ -7,16 +7,19 @@ from contextlib import closing
 from pathlib import Path
 
 from thorndike import startup
+from thorndike.algorithms import ALGORITHMS
 from thorndike.api.building import EnvironmentLike, Job, Request, build_job, check_algorithm, full_request, is_large
 from thorndike.api.exporting import export_policy
 from thorndike.api.planning import plan_run
 from thorndike.api.recorded_run import Objects, rebuild, request_in
+from thorndike.api.starting import first_carry, offline_request
 from thorndike.api.training_result import Result
 from thorndike.environments import registry
 from thorndike.errors import UserError
 from thorndike.networks.network import NetworkBuilder
 from thorndike.records import read_record
 from thorndike.training.checkpoints import restore, save_checkpoint
+from thorndike.training.datasets import is_dataset, read_dataset
 from thorndike.training.faults import locate
 from thorndike.training.json_files import Json
 from thorndike.training.metrics import last_points
@@ -28,6 +31,9 @@ from thorndike.training.run_lock import run_lock
 from thorndike.training.runner import Stopwatch
 from thorndike.training.session import RECENT, Keeping, NotFinite, Outcome, Start, run_session
 from thorndike.types import Wrapper
+
+SHAPES = ("net_arch", "activation")
+"""The settings that the sizes of networks follow from."""
 
 
 def train(
@@ -50,10 +56,14 @@ def train(
     network: NetworkBuilder | None = None,
     env_kwargs: Mapping[str, object] | None = None,
     env_timeout: float | None = None,
+    start_from: str | Path | None = None,
     progress: bool = False,
     command: str | None = None,
 ) -> Result:
     """Train ``seeds`` independent agents and keep everything in a new run directory.
+
+    ``environment`` may be the folder of a dataset: a learner from data then makes ``steps`` updates, and is evaluated on the environment that
+    the dataset names. ``start_from`` is such a run, whose networks and dataset an online one begins with.
 
     ``steps`` are environment steps of each seed. What is not given comes from the environment's preset, then from the algorithm's
     defaults; ``preset="none"`` ignores presets. ``wrappers`` are those of ``thorndike.environments.wrappers``; ``network`` builds a
@@ -63,11 +73,23 @@ def train(
     check_algorithm(algorithm)
     if not 0 <= seed < 2**32 or seeds < 1:
         raise UserError(f"a seed is a number from 0 to 2^32 - 1, and there is at least one; got seed={seed}, seeds={seeds}")
+    data = read_dataset(str(environment)) if is_dataset(environment) else None
+    check_source(algorithm, environment, data is not None)
+    if data is not None:
+        refuse_stepping(num_envs, engine, wrappers, env_kwargs, max_episode_steps, start_from)
+        environment, env_kwargs, max_episode_steps = data.origin[:3]
     choice = registry.resolve(environment, engine=engine, env_kwargs=env_kwargs, max_episode_steps=max_episode_steps)
     if algorithm == "planning":
         return plan_run(choice, settings or {}, output, name, command)
     found = find_preset(algorithm, choice.id, preset)
-    request = full_request(algorithm, choice, found, wrappers, settings or {}, steps, num_envs, seeds, seed, checkpoint_every)
+    settings, started = dict(settings or {}), None
+    if start_from is not None:
+        # Networks of the same size, unless they are asked for; what acts knows already how, so that nothing is drawn at random first.
+        before, started = offline_request(Path(start_from), algorithm, choice.id), str(Path(start_from).absolute())
+        settings = {name: before.config[name] for name in SHAPES} | {"learning_starts": 0} | settings
+    request = full_request(
+        algorithm, choice, found, wrappers, settings, steps, num_envs, seeds, seed, checkpoint_every, data=data, start_from=started
+    )
     backend = startup.choose_device(device, is_large(algorithm, choice))
     job = build_job(request, choice, wrappers, network, env_timeout)
     run = new_run_directory(output, choice.id, algorithm, name)
@@ -75,7 +97,7 @@ def train(
     record = {**facts(), "status": "running", "command": command, "device": backend, **objects, **as_json(request)}
     with closing(job), run_lock(run):
         _begin_record(run, record)
-        return _conduct(run, record, job, progress, lambda: Start(job.runner.init()))
+        return _conduct(run, record, job, progress, lambda: Start(first_carry(job)))
 
 
 def resume(
@@ -114,6 +136,33 @@ def runs(output: str | Path = "runs") -> list[Path]:
     return sorted((path.parent for path in Path(output).glob("*/*/*/run.json")), key=lambda path: path.name)
 
 
+def check_source(algorithm: str, environment: object, is_data: bool) -> None:
+    """Raises ``UserError`` if the algorithm does not learn from a dataset, or from an environment, whichever is named."""
+    kind = "dataset" if is_data else "environment"
+    if kind in ALGORITHMS[algorithm].learns_from:
+        return
+    others = ", ".join(name for name, entry in ALGORITHMS.items() if kind in entry.learns_from)
+    if is_data:
+        raise UserError(f"{algorithm} learns from an environment, and {environment} is a dataset; those that learn from one: {others}")
+    raise UserError(f"{algorithm} learns from a dataset, and {environment} is none: make one with thorndike record RUN, and give its folder")
+
+
+def refuse_stepping(
+    num_envs: int | None,
+    engine: str,
+    wrappers: Sequence[Wrapper] | None,
+    env_kwargs: Mapping[str, object] | None,
+    max_episode_steps: int | None,
+    start_from: str | Path | None,
+) -> None:
+    """Raises ``UserError`` for what has no meaning where no environment is stepped, rather than leave it out."""
+    given = {"num_envs": num_envs, "wrappers": wrappers, "env_kwargs": env_kwargs, "max_episode_steps": max_episode_steps}
+    given |= {"engine": engine if engine != "auto" else None, "start_from": start_from}
+    for name, value in given.items():
+        if value:
+            raise UserError(f"a dataset is as it was recorded, and no environment is stepped: leave {name} out")
+
+
 def _conduct(run: Path, record: Json, job: Job, progress: bool, begin: Callable[[], Start]) -> Result:
     """Run the session; whatever happens, ``run.json`` says how it ended."""
     spent = Stopwatch()
@@ -145,7 +194,7 @@ def _explained(run: Path, job: Job, error: NotFinite) -> str:
     """The error, with the first culprit found again from the last checkpoint where the engine can repeat itself."""
     if job.runner.inspect is None:
         return str(error)
-    carry, first = job.runner.init(), 0
+    carry, first = first_carry(job), 0
     if checkpoints(run):
         carry, progressed = restore(run, job.runner, job.source, as_json(job.request))
         first = progressed.iteration
@@ -172,7 +221,7 @@ def _restored(run: Path, job: Job) -> Start:
     if not checkpoints(run):
         notice(f"{run} was stopped before its first checkpoint: it begins again")
         truncate_lines(run / "metrics.jsonl", 0)
-        return Start(job.runner.init())
+        return Start(first_carry(job))
     carry, progressed = restore(run, job.runner, job.source, as_json(job.request))
     return Start(carry, progressed, last_points(run, RECENT, job.request.seeds))
 

@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
@@ -44,6 +45,15 @@ def epsilon_greedy(
     action = (rank <= jnp.expand_dims(draw, -1)).sum(axis=-1, dtype=jnp.int32)
     chosen = lax.broadcasted_iota(jnp.int32, q.shape, q.ndim - 1) == jnp.expand_dims(action, -1)
     return Choice(action, (chosen & best).any(axis=-1))
+
+
+def epsilon_greedy_probabilities(
+    q: Float[Array, "*batch actions"], epsilon: Float[Array, ""], allowed: Bool[Array, "*batch actions"] | None = None
+) -> Float[Array, "*batch actions"]:
+    """What ``epsilon_greedy`` without random ties chooses each action with."""
+    first = jax.nn.one_hot(q.argmax(axis=-1), q.shape[-1])
+    at_random = jnp.ones(q.shape, q.dtype) if allowed is None else (allowed | (q >= q.max(axis=-1, keepdims=True))).astype(q.dtype)
+    return epsilon * at_random / at_random.sum(axis=-1, keepdims=True) + (1.0 - epsilon) * first
 
 
 def _running_count(mask: Bool[Array, "*batch n"]) -> Int[Array, "*batch n"]:

@@ -56,6 +56,14 @@ def to_environment(space: gymnasium.Space, action: Action) -> Action:
     return low + (jnp.clip(action, -1.0, 1.0) + 1.0) * (0.5 * (high - low))
 
 
+def from_environment(space: gymnasium.Space, action: Action) -> Action:
+    """The learner's action for one in the environment's units: the inverse of ``to_environment`` within the bounds."""
+    if not isinstance(space, gymnasium.spaces.Box) or not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
+        return action
+    low, high = (bound.astype(np.float32) for bound in (space.low, space.high))
+    return 2.0 * (action - low) / (high - low) - 1.0
+
+
 def by_iteration(noise: Noise, iterations: int) -> Noise:
     """Noise ``[iterations * T, ...]`` as ``[iterations, T, ...]``."""
     return jax.tree.map(lambda x: x.reshape((iterations, -1, *x.shape[1:])), noise)
