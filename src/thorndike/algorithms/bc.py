@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Key
 
 from thorndike.functional.descent import Optimized, descend, optimized
 from thorndike.functional.policy_losses import weighted_mean
-from thorndike.networks.either_actions import StochasticPolicy, is_discrete, stochastic_policy
+from thorndike.networks.either_actions import StochasticPolicy, number_of_actions, stochastic_policy
 from thorndike.networks.heads import Shape
 from thorndike.networks.network import NetworkBuilder
 from thorndike.networks.torso import ACTIVATIONS
@@ -63,7 +63,7 @@ def cloning_loss(params: Float[Array, " P"], policy: StochasticPolicy, batch: Tr
 def bc(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) -> Algorithm:
     """Behaviour cloning of Discrete or Box actions. Raises ``UserError`` for other action spaces."""
     policy = stochastic_policy("bc", spec, Shape(config.net_arch, config.activation), network)
-    optimizer, discrete = optax.scale_by_adam(), is_discrete(spec)
+    optimizer, discrete = optax.scale_by_adam(), number_of_actions(spec) is not None
 
     def learn(learnt: Learnt, batch: Transitions, drawn: Array, rate: Array, number: Array) -> tuple[Learnt, Metrics]:
         (loss, metrics), gradient = jax.value_and_grad(cloning_loss, has_aux=True)(learnt.actor.params, policy, batch, discrete)

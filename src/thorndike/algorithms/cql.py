@@ -1,7 +1,7 @@
 """Conservative Q-learning (CQL): values of actions that the dataset does not hold are pushed down.
 
-Kumar, Zhou, Tucker, Levine 2020, "Conservative Q-Learning for Offline Reinforcement Learning" (arXiv:2006.04779), in its form CQL(H): double
-deep Q-learning where actions are Discrete, soft actor-critic where they are a Box. Deviations:
+Kumar, Zhou, Tucker, Levine 2020, "Conservative Q-Learning for Offline Reinforcement Learning" (arXiv:2006.04779), in its form CQL(H):
+double deep Q-learning where actions are Discrete, soft actor-critic where they are a Box. Deviations:
 
 1. The weight alpha is given, not learnt by a Lagrangian.
 2. One learning rate for the policy and the critics; the paper's policy learns more slowly (1e-4).
@@ -30,7 +30,7 @@ from thorndike.functional.soft_policy import SoftPolicy, improve_policy, soft_po
 from thorndike.functional.squashed_gaussian import sample_squashed, squashed_mode
 from thorndike.functional.temporal_difference import select
 from thorndike.networks.continuous import box_dimensions, critics, policy_outputs
-from thorndike.networks.either_actions import action_values, is_discrete
+from thorndike.networks.either_actions import action_values, number_of_actions
 from thorndike.networks.heads import Shape
 from thorndike.networks.network import NetworkBuilder
 from thorndike.networks.torso import ACTIVATIONS
@@ -86,11 +86,12 @@ class Acting(NamedTuple):
 
 def cql(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) -> Algorithm:
     """CQL for Discrete or Box actions. Raises ``UserError`` for other action spaces."""
-    if not is_discrete(spec):
+    count = number_of_actions(spec)
+    if count is None:
         return offline(conservative_actor_critic(config, spec, network), config, spec, config.gamma)
     if network is not None:
         raise UserError("cql has no policy network where actions are Discrete: leave network out")
-    method, count = conservative_q(config, spec), int(spec.action_space.n)
+    method = conservative_q(config, spec)
     return offline(method, config, spec, config.gamma, lambda params, obs: jax.nn.one_hot(method.greedy(params, obs), count))
 
 
@@ -153,12 +154,17 @@ def conservative_actor_critic(config: Config, spec: EnvSpec, network: NetworkBui
         """Uniform actions and the policy's, ``[2 N, M, D]``, and the log of their densities."""
         # The distribution function of the normal makes its noise uniform.
         uniform = jax.scipy.special.erf(noise[:count] * 0.5**0.5)
-        drawn, density = sample_squashed(jnp.broadcast_to(policy.apply(actor, obs)[None], (count, *noise.shape[1:2], 2 * dimensions)), noise[count:])
+        parameters = policy.apply(actor, obs)
+        drawn, density = sample_squashed(jnp.broadcast_to(parameters, (count, *parameters.shape)), noise[count:])
         even = jnp.full(density.shape, -dimensions * math.log(2.0))
         return jnp.concatenate([uniform, drawn]), jnp.concatenate([even, density])
 
     def loss_of(
-        params: Float[Array, "K P"], batch: Transitions, target: Float[Array, "M 1"], others: Float[Array, "N M D"], density: Float[Array, "N M"]
+        params: Float[Array, "K P"],
+        batch: Transitions,
+        target: Float[Array, "M 1"],
+        others: Float[Array, "N M D"],
+        density: Float[Array, "N M"],
     ) -> tuple[Array, Metrics]:
         values = net.apply(params, batch.obs, batch.action)
         sampled = jax.vmap(lambda action: net.apply(params, batch.obs, action)[..., 0], out_axes=-1)(others)

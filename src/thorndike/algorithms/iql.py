@@ -82,8 +82,12 @@ def iql(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) ->
     def init(key: Key[Array, ""]) -> Learnt:
         key_policy, key_value, key_critics = jax.random.split(key, 3)
         judges = net.init(key_critics)
-        held = (optimized(params, optimizer) for params in (policy.init(key_policy), init_value(key_value), judges))
-        return Learnt(*held, jnp.array(judges))
+        return Learnt(
+            actor=optimized(policy.init(key_policy), optimizer),
+            value=optimized(init_value(key_value), optimizer),
+            critics=optimized(judges, optimizer),
+            target_params=jnp.array(judges),
+        )
 
     def value_loss(params: Float[Array, " V"], batch: Transitions, q: Float[Array, " M"]) -> tuple[Array, Array]:
         value = values.apply(params, batch.obs)[:, 0]
@@ -130,4 +134,5 @@ def iql(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) ->
         draw=lambda key, updates: jnp.zeros((updates, 0)),
         learn=learn,
     )
-    return offline(method, config, spec, config.gamma, None if probabilities is None else lambda acting, obs: probabilities(acting.actor, obs))
+    told = None if probabilities is None else lambda acting, obs: probabilities(acting.actor, obs)
+    return offline(method, config, spec, config.gamma, told)

@@ -7,7 +7,6 @@ from contextlib import closing
 from pathlib import Path
 
 from thorndike import startup
-from thorndike.algorithms import ALGORITHMS
 from thorndike.api.building import EnvironmentLike, Job, Request, build_job, check_algorithm, full_request, is_large
 from thorndike.api.exporting import export_policy
 from thorndike.api.planning import plan_run
@@ -16,10 +15,11 @@ from thorndike.api.starting import first_carry, offline_request
 from thorndike.api.training_result import Result
 from thorndike.environments import registry
 from thorndike.errors import UserError
+from thorndike.learning_sources import check_source, is_dataset
 from thorndike.networks.network import NetworkBuilder
 from thorndike.records import read_record
 from thorndike.training.checkpoints import restore, save_checkpoint
-from thorndike.training.datasets import is_dataset, read_dataset
+from thorndike.training.datasets import read_dataset
 from thorndike.training.faults import locate
 from thorndike.training.json_files import Json
 from thorndike.training.metrics import last_points
@@ -62,8 +62,8 @@ def train(
 ) -> Result:
     """Train ``seeds`` independent agents and keep everything in a new run directory.
 
-    ``environment`` may be the folder of a dataset: a learner from data then makes ``steps`` updates, and is evaluated on the environment that
-    the dataset names. ``start_from`` is such a run, whose networks and dataset an online one begins with.
+    ``environment`` may be the folder of a dataset: a learner from data then makes ``steps`` updates, and is evaluated on the
+    environment that the dataset names. ``start_from`` is such a run, whose networks and dataset an online one begins with.
 
     ``steps`` are environment steps of each seed. What is not given comes from the environment's preset, then from the algorithm's
     defaults; ``preset="none"`` ignores presets. ``wrappers`` are those of ``thorndike.environments.wrappers``; ``network`` builds a
@@ -73,8 +73,8 @@ def train(
     check_algorithm(algorithm)
     if not 0 <= seed < 2**32 or seeds < 1:
         raise UserError(f"a seed is a number from 0 to 2^32 - 1, and there is at least one; got seed={seed}, seeds={seeds}")
+    check_source(algorithm, environment)
     data = read_dataset(str(environment)) if is_dataset(environment) else None
-    check_source(algorithm, environment, data is not None)
     if data is not None:
         refuse_stepping(num_envs, engine, wrappers, env_kwargs, max_episode_steps, start_from)
         environment, env_kwargs, max_episode_steps = data.origin[:3]
@@ -136,17 +136,6 @@ def runs(output: str | Path = "runs") -> list[Path]:
     return sorted((path.parent for path in Path(output).glob("*/*/*/run.json")), key=lambda path: path.name)
 
 
-def check_source(algorithm: str, environment: object, is_data: bool) -> None:
-    """Raises ``UserError`` if the algorithm does not learn from a dataset, or from an environment, whichever is named."""
-    kind = "dataset" if is_data else "environment"
-    if kind in ALGORITHMS[algorithm].learns_from:
-        return
-    others = ", ".join(name for name, entry in ALGORITHMS.items() if kind in entry.learns_from)
-    if is_data:
-        raise UserError(f"{algorithm} learns from an environment, and {environment} is a dataset; those that learn from one: {others}")
-    raise UserError(f"{algorithm} learns from a dataset, and {environment} is none: make one with thorndike record RUN, and give its folder")
-
-
 def refuse_stepping(
     num_envs: int | None,
     engine: str,
@@ -156,8 +145,8 @@ def refuse_stepping(
     start_from: str | Path | None,
 ) -> None:
     """Raises ``UserError`` for what has no meaning where no environment is stepped, rather than leave it out."""
-    given = {"num_envs": num_envs, "wrappers": wrappers, "env_kwargs": env_kwargs, "max_episode_steps": max_episode_steps}
-    given |= {"engine": engine if engine != "auto" else None, "start_from": start_from}
+    given: dict[str, object] = {"num_envs": num_envs, "wrappers": wrappers, "env_kwargs": env_kwargs, "start_from": start_from}
+    given |= {"max_episode_steps": max_episode_steps, "engine": engine if engine != "auto" else None}
     for name, value in given.items():
         if value:
             raise UserError(f"a dataset is as it was recorded, and no environment is stepped: leave {name} out")

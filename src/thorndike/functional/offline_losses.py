@@ -25,12 +25,12 @@ def advantage_weights(advantage: Float[Array, " M"], temperature: Number, most: 
 def conservative_gap(q: Float[Array, "K M A"], taken: Float[Array, "K M"], weight: Float[Array, " M"]) -> Float[Array, ""]:
     """How far Q of any action lies above that of the dataset's: ``E[log sum_a exp Q(s, a) - Q(s, a_data)]``, summed over critics.
 
-    Kumar et al. 2020 (arXiv:2006.04779), eq. 4: CQL(H). Of continuous actions ``q`` are samples with ``log density + log number`` taken off.
+    Kumar et al. 2020 (arXiv:2006.04779), eq. 4: CQL(H). Of a Box ``q`` are samples with ``log density + log number`` taken off.
     """
     above = jax.nn.logsumexp(q, axis=-1) - taken
     return jnp.sum(jax.vmap(weighted_mean, (0, None))(above, weight))
 
 
 def cloning_scale(q: Float[Array, " M"], alpha: Number, weight: Float[Array, " M"]) -> Float[Array, ""]:
-    """``alpha / E|Q|``, with no gradient: what Q is worth beside a squared error of actions (Fujimoto and Gu 2021, arXiv:2106.06860, eq. 5)."""
+    """``alpha / E|Q|``, with no gradient: what Q weighs beside a squared error (Fujimoto and Gu 2021, arXiv:2106.06860, eq. 5)."""
     return jax.lax.stop_gradient(alpha / jnp.maximum(weighted_mean(jnp.abs(q), weight), 1e-6))

@@ -48,9 +48,9 @@ class ActionValues(NamedTuple):
     """parameters, obs -> values of all Discrete actions, those forbidden very low; None of a Box."""
 
 
-def is_discrete(spec: EnvSpec) -> bool:
-    """Whether actions are Discrete."""
-    return isinstance(spec.action_space, gymnasium.spaces.Discrete)
+def number_of_actions(spec: EnvSpec) -> int | None:
+    """How many Discrete actions there are; None where actions are of another kind."""
+    return int(spec.action_space.n) if isinstance(spec.action_space, gymnasium.spaces.Discrete) else None
 
 
 def stochastic_policy(name: str, spec: EnvSpec, shape: Shape, given: NetworkBuilder | None = None) -> StochasticPolicy:
@@ -58,9 +58,9 @@ def stochastic_policy(name: str, spec: EnvSpec, shape: Shape, given: NetworkBuil
 
     Raises ``UserError`` for other action spaces.
     """
-    if not is_discrete(spec):
+    count = number_of_actions(spec)
+    if count is None:
         return _gaussian(name, spec, shape, given)
-    count = int(spec.action_space.n)
     network, init = policy_outputs(spec, count, shape.net_arch, shape.activation, given)
     logits, family = masked(network, spec).apply, categorical(count)
 
@@ -80,10 +80,11 @@ def stochastic_policy(name: str, spec: EnvSpec, shape: Shape, given: NetworkBuil
 
 def action_values(name: str, spec: EnvSpec, number: int, shape: Shape) -> ActionValues:
     """``number`` critics. Raises ``UserError`` for actions that are neither Discrete nor a Box of one row."""
-    if not is_discrete(spec):
+    count = number_of_actions(spec)
+    if count is None:
         ensemble = critics(spec, box_dimensions(name, spec), number, shape.net_arch, shape.activation, layer_norm=shape.layer_norm)
         return ActionValues(ensemble.init, lambda params, obs, action: ensemble.apply(params, obs, action)[..., 0], None)
-    plain, example = q_network(spec, int(spec.action_space.n), shape, dueling=False), example_observation(spec.observation_space)
+    plain, example = q_network(spec, count, shape, dueling=False), example_observation(spec.observation_space)
     flat = flattened(plain, example)
 
     def init(key: Key[Array, ""]) -> Float[Array, "K P"]:

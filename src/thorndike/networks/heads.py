@@ -209,9 +209,7 @@ def _pair(module: nn.Module) -> Network:
     return Network(init=lambda key, obs: module.init(key, obs)["params"], apply=lambda params, obs: module.apply({"params": params}, obs))
 
 
-def softmax_probabilities(
-    network: Network, space: gymnasium.Space
-) -> Callable[[PyTree, PyTree, Observation], Float[Array, "*B n"]] | None:
+def softmax_probabilities(network: Network, space: gymnasium.Space) -> Callable[[PyTree, PyTree, Observation], Float[Array, "*B n"]] | None:
     """Parameters, memory, obs -> the probability of each Discrete action, of a network that gives logits and a value; None for others."""
     if not isinstance(space, gymnasium.spaces.Discrete):
         return None

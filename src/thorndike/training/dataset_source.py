@@ -5,9 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int, Key, PyTree
 
+from thorndike.environments.host.steps import host_step
 from thorndike.training.datasets import Dataset
 from thorndike.training.sources import from_environment
-from thorndike.types import Algorithm, EnvSpec, EpisodeStats, Rollout, Source, Step
+from thorndike.types import Algorithm, EnvSpec, EpisodeStats, Rollout, Source
 
 ENGINE = "dataset"
 
@@ -20,8 +21,15 @@ def dataset_spec(data: Dataset) -> EnvSpec:
 
 def whole_dataset(data: Dataset) -> Rollout:
     """All steps in order, as a rollout ``[N, ...]`` in the learner's units."""
-    no = np.zeros_like(data.reward)
-    step = Step(data.next_obs, data.next_obs, data.reward, no, data.terminated, data.truncated, np.ones(len(no), bool))
+    step = host_step(
+        data.next_obs,
+        data.next_obs,
+        reward=data.reward,
+        cost=np.zeros_like(data.reward),
+        terminated=data.terminated,
+        truncated=data.truncated,
+        valid=np.ones(len(data.reward), np.bool_),
+    )
     return Rollout(data.obs, from_environment(data.origin.action_space, data.action), {}, step, ())
 
 

@@ -21,14 +21,13 @@ from jaxtyping import PyTree
 
 from thorndike.environments.host.arrays import array_dtype
 from thorndike.errors import UserError
+from thorndike.learning_sources import DATA, METADATA, is_dataset
 from thorndike.training.json_files import OBJECT, TEXT, Json, as_bytes, check_fields, optional, parse_object, read_object, whole
 from thorndike.training.minari_spaces import is_encoded_image, space_of_text, space_text
 
 if TYPE_CHECKING:
     import h5py
 
-DATA = Path("data", "main_data.hdf5")
-METADATA = Path("data", "metadata.json")
 PROBABILITY = "behavior_probability"
 _PARTS = ("observations", "actions", "rewards", "terminations", "truncations")
 _MINARI = "0.5.4"
@@ -92,16 +91,13 @@ class Dataset(NamedTuple):
         return np.add.reduceat(self.reward.astype(np.float64), self.starts)
 
 
-def is_dataset(place: object) -> bool:
-    """Whether a name is that of a folder with a dataset in it."""
-    return isinstance(place, str | Path) and os.path.isfile(Path(place) / METADATA)
-
-
 def read_dataset(path: str | Path) -> Dataset:
     """The dataset in a folder. Raises ``UserError``, in one line that names file and episode, for one that is malformed."""
     path = Path(path)
     if not is_dataset(path):
-        raise UserError(f"{path} is no dataset: it has no {METADATA}; make one with thorndike record RUN, or give a Minari dataset's folder")
+        raise UserError(
+            f"{path} is no dataset: it has no {METADATA}; make one with thorndike record RUN, or give a Minari dataset's folder"
+        )
     facts = read_object(path / METADATA)
     origin, file = _origin(facts, path / METADATA), path / DATA
     if facts.get("data_format", "hdf5") != "hdf5":
