@@ -9,12 +9,35 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from thorndike.algorithms import a2c, crossq, ddpg, dqn, iqn, ppo, pqn, q_learning, qr_dqn, rainbow, redq, reinforce, sac, td3, tqc
+from made_up_data import BOX, DISCRETE, made_up
+from thorndike.algorithms import (
+    a2c,
+    awac,
+    bc,
+    cql,
+    crossq,
+    ddpg,
+    dqn,
+    iql,
+    iqn,
+    ppo,
+    pqn,
+    q_learning,
+    qr_dqn,
+    rainbow,
+    redq,
+    reinforce,
+    sac,
+    td3,
+    td3_bc,
+    tqc,
+)
 from thorndike.environments import wrappers
 from thorndike.environments.native import factory
 from thorndike.environments.native.vectorize import vectorize
 from thorndike.training import runner as runner_module
 from thorndike.training.checkpoints import Progressed, restore, save_checkpoint
+from thorndike.training.dataset_source import dataset_source, dataset_spec
 from thorndike.training.run_directory import checkpoints
 from thorndike.training.runner import Carry, Runner, runner
 from thorndike.training.sources import compiled_source
@@ -51,6 +74,22 @@ class Case(NamedTuple):
         return algorithm, compiled_source(environment, algorithm, wrapper)
 
 
+class DataCase(NamedTuple):
+    """A learner from a dataset."""
+
+    build: object
+    config: object
+    space: object
+
+    def make(self) -> tuple[Algorithm, Source]:
+        data = made_up(self.space)
+        algorithm = self.build(self.config, dataset_spec(data))
+        return algorithm, dataset_source(data, algorithm)
+
+
+DATA = {"total_steps": 1000, "batch_size": 8, "net_arch": (8,)}
+
+
 def parts(config, **changes):
     return dataclasses.replace(config, **changes)
 
@@ -67,10 +106,19 @@ RUN = {
     "rainbow": Case(rainbow.rainbow, rainbow.Config(**OF_THE_FAMILY, atoms=11), "CartPole-v1"),
     "pqn": Case(pqn.pqn, pqn.Config(total_steps=1000, n_steps=8, batch_size=16, n_epochs=2, net_arch=(8,)), "CartPole-v1"),
     "q_learning": Case(q_learning.q_learning, parts(TABLE, variant="sarsa"), "MountainCar-v0", BINS),
+    "iql": DataCase(iql.iql, iql.Config(**DATA, learning_rate="linear(1e-3, 0)"), DISCRETE),
+    "td3_bc": DataCase(td3_bc.td3_bc, td3_bc.Config(**DATA), BOX),
+    "cql, Box": DataCase(cql.cql, cql.Config(**DATA, n_actions=2), BOX),
 }
 ALL = RUN | {
     "sac, one update a step": Case(sac.sac, sac.Config(**CONTROL | {"train_freq": 4, "gradient_steps": 1}), "Pendulum-v1", NORMALISED),
     "sac, fixed temperature": Case(sac.sac, sac.Config(**CONTROL, ent_coef=0.1, layer_norm=True), "MountainCarContinuous-v0"),
+    "bc": DataCase(bc.bc, bc.Config(**DATA), DISCRETE),
+    "bc, Box": DataCase(bc.bc, bc.Config(**DATA), BOX),
+    "iql, Box": DataCase(iql.iql, iql.Config(**DATA), BOX),
+    "cql": DataCase(cql.cql, cql.Config(**DATA), DISCRETE),
+    "awac": DataCase(awac.awac, awac.Config(**DATA), BOX),
+    "awac, online": Case(awac.awac, awac.Config(**CONTROL), "Pendulum-v1"),
     "ddpg": Case(ddpg.ddpg, ddpg.Config(**CONTROL), "Pendulum-v1"),
     "tqc": Case(tqc.tqc, tqc.Config(**CONTROL, n_quantiles=5), "Pendulum-v1"),
     "redq": Case(redq.redq, redq.Config(**CONTROL | {"gradient_steps": 4}, policy_delay=4), "Pendulum-v1"),
@@ -131,7 +179,7 @@ class Bound(NamedTuple):
     traces: list[str]
 
 
-SLOW = ("td3", "crossq", "dqn, lstm", "a2c, gru", "pqn")
+SLOW = ("td3", "crossq", "dqn, lstm", "a2c, gru", "pqn", "td3_bc", "cql, Box")
 """Cases whose machinery another one runs too."""
 
 

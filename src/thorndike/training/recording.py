@@ -1,13 +1,12 @@
 """Episodes of a policy on reference environments, written down step by step, with the probability of every Discrete action."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import gymnasium
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float, Int, PyTree
 
 from thorndike.errors import UserError
 from thorndike.training.acting import acting
@@ -92,23 +91,25 @@ class _Recorder:
         wrapper_memory, seen = self._moves.first_sight(agent[1], obs)
         memory, t = self._moves.fresh_memory(), 0
         while not self._enough(wanted):
-            key = jax.random.fold_in(jax.random.fold_in(jax.random.key(self._seed), _RECORDING), t)
-            later, proposed, chances = self._decide(*jax.tree.map(lambda x: x[0], (agent[0], memory, seen)), key)
+            later, proposed, chances = self._decide(agent[0], memory, seen, np.int32(t))
             action, probability = self._choose(np.asarray(proposed), None if chances is None else np.asarray(chances))
-            raw = pool.step(jnp.asarray(action[None]))
+            raw = pool.step(cast(Array, action[None]))
             self._write(obs, action, raw, probability)
-            wrapper_memory, step = self._moves.see(agent[1], wrapper_memory, obs, jnp.asarray(action[None]), raw)
-            memory = self._moves.forget(raw.done | ~raw.valid, jax.tree.map(lambda x: x[None], later))
+            wrapper_memory, step = self._moves.see(agent[1], wrapper_memory, obs, cast(Array, action[None]), raw)
+            memory = self._moves.forget(raw.done | ~raw.valid, later)
             obs, seen, t = raw.obs, step.obs, t + 1
         limit = None if wanted.episodes is None else wanted.episodes // pool.num_envs
         found = [episode for row in self._done for episode in row[:limit]]
         return [episode._replace(seed=seeds[0]) if i == 0 and pool.num_envs == 1 else episode for i, episode in enumerate(found)]
 
-    def _decision(self, actor: PyTree, memory: PyTree, seen: Observation, key: Array) -> tuple[PyTree, Array, Array | None]:
+    def _decision(self, actor: PyTree, memory: PyTree, seen: Observation, t: Int[Array, ""]) -> tuple[PyTree, Array, Array | None]:
+        """One decision; actor, memories and observations lead with an axis of one seed."""
+        actor, memory, seen = jax.tree.map(lambda x: x[0], (actor, memory, seen))
+        noise = self._policy.noise(jax.random.fold_in(jax.random.fold_in(jax.random.key(self._seed), _RECORDING), t), self._pool.num_envs)
         choose = self._policy.algorithm.greedy if self._behavior.deterministic else self._policy.algorithm.act
-        later, action, _ = choose(actor, memory, seen, self._policy.noise(key, self._pool.num_envs))
+        later, action, _ = choose(actor, memory, seen, noise)
         chances = None if self._chance is None else self._chance(actor, memory, seen)
-        return later, to_environment(self._space, action), chances
+        return jax.tree.map(lambda x: x[None], later), to_environment(self._space, action), chances
 
     def _choose(self, proposed: np.ndarray, chances: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
         """Actions of the behaviour in the environment's units, and their probabilities."""
