@@ -1,14 +1,15 @@
 """Learning from datasets of our own, ten seeds each, and estimates of a policy's worth beside the true one.
 
-python benchmarks/offline.py            make agents, datasets and the table: benchmarks/results/offline.json (about 20 CPU-minutes)
-python benchmarks/offline.py --tables   write the tables of docs/offline.md from it
+python benchmarks/offline.py                    everything, about 10 CPU-minutes: benchmarks/results/offline.json, row by row
+python benchmarks/offline.py Pendulum-v1        one environment's rows
+python benchmarks/offline.py evaluation         the estimates alone
+python benchmarks/offline.py --tables           write the tables of docs/offline.md from that file
 """
 
 import argparse
 import json
 import sys
 import tempfile
-import time
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,7 +21,7 @@ from thorndike.training.datasets import episodes_of
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results" / "offline.json"
 DOCS = ROOT / "docs" / "offline.md"
-SEEDS, EPISODES, UPDATES = 10, 10, 4_000
+SEEDS, EPISODES, UPDATES, LOGS = 10, 10, 4_000, 10
 SIZES = {"net_arch": (64, 64), "batch_size": 128, "learning_rate": 1e-3}
 
 
@@ -37,85 +38,75 @@ class Task(NamedTuple):
     learners: dict[str, dict]
 
 
+PENDULUM = {
+    "bc": {},
+    "iql": {"temperature": 1.0, "expectile": 0.8, "tau": 0.01},
+    "td3_bc": {"alpha": 10.0, "tau": 0.02},
+    "cql": {"alpha": 1.0, "n_actions": 4, "tau": 0.01},
+}
+CARTPOLE = {
+    "bc": {},
+    "iql": {"temperature": 0.3, "expectile": 0.9, "tau": 0.02},
+    "cql": {"alpha": 0.3, "tau": 0.02},
+}
+SAC = {"net_arch": (64, 64), "learning_rate": 1e-3, "learning_starts": 500}
 TASKS = (
-    Task(
-        "Pendulum-v1",
-        "sac",
-        {"net_arch": (64, 64), "learning_rate": 1e-3, "learning_starts": 500},
-        3_000,
-        15_000,
-        (10_000, 8_000, 2_000),
-        {"bc": {}, "iql": {"temperature": 3.0, "expectile": 0.9}, "td3_bc": {}, "cql": {"n_actions": 4, "alpha": 1.0}},
-    ),
-    Task(
-        "CartPole-v1",
-        "ppo",
-        {},
-        10_000,
-        100_000,
-        (8_000, 6_000, 2_000),
-        {"bc": {}, "iql": {"temperature": 1.0, "expectile": 0.9}, "cql": {"alpha": 1.0}},
-    ),
+    Task("Pendulum-v1", "sac", SAC, 3_000, 15_000, (10_000, 8_000, 2_000), PENDULUM),
+    Task("CartPole-v1", "ppo", {}, 10_000, 100_000, (8_000, 6_000, 2_000), CARTPOLE),
 )
+DATASETS = ("mixed", "random", "medium", "expert")
 
 
-def make_datasets(task: Task, folder: Path) -> tuple[dict[str, str], dict[str, Path]]:
-    """Runs of the agents and datasets of their steps, by name."""
-    agents = {
-        level: td.train(task.agent, task.environment, steps=steps, settings=task.settings, preset="none", output=folder / "runs").run
-        for level, steps in (("medium", task.medium_steps), ("expert", task.expert_steps))
-    }
-    places = {}
-    for name, agent, share in (("random", "medium", 1.0), ("medium", "medium", 0.0), ("expert", "expert", 0.0)):
-        places[name] = td.record(
-            agents[agent], steps=sum(task.mixture), random_share=share, to=folder / task.environment / f"{name}-v0"
-        ).path
-    parts = []
-    for number, (name, agent, share) in enumerate((("random", "medium", 1.0), ("medium", "medium", 0.0), ("expert", "expert", 0.0))):
-        to = folder / task.environment / f"part-{name}-v0"
-        parts.append(td.record(agents[agent], steps=task.mixture[number], random_share=share, seed=1, to=to).path)
-    places["mixed"] = td.mix(*parts, to=folder / task.environment / "mixed-v0").path
-    return agents, places
+def make_agents(task: Task, folder: Path) -> dict[str, Path]:
+    """The runs that record: one stopped early, and one trained well."""
+    levels = (("medium", task.medium_steps), ("expert", task.expert_steps))
+    asked = {"settings": task.settings, "preset": "none", "output": folder / "runs"}
+    return {level: td.train(task.agent, task.environment, steps=steps, **asked).run for level, steps in levels}
 
 
-def score(task: Task, places: dict[str, Path], folder: Path) -> list[dict]:
-    """A row a dataset: its own returns, and what each learner makes of it."""
-    rows = []
-    for name, place in places.items():
-        data = td.dataset(place)
-        row = {"environment": task.environment, "dataset": name, "steps": len(data.reward), "episodes": len(data.lengths)}
-        row |= {"behavior": float(data.returns.mean()), "best_episode": float(data.returns.max()), "learners": {}}
-        for learner, settings in task.learners.items():
-            made = td.train(learner, str(place), steps=UPDATES, seeds=SEEDS, settings=SIZES | settings, output=folder / "runs")
-            found = td.load(made.run).evaluate(EPISODES)
-            row["learners"][learner] = {
-                "mean": found.mean,
-                "iqm": found.iqm,
-                "min": found.min,
-                "ci95": found.ci95,
-                "per_seed": found.per_seed,
-            }
-            row["learners"][learner] |= {"settings": SIZES | settings, "updates": UPDATES, "cpu_s": made.cpu_s}
-            print(f"{task.environment} {name} {learner}: {found.mean:.1f} ({made.cpu_s:.0f} CPU-s)", file=sys.stderr, flush=True)
-        rows.append(row)
-    return rows
+def make_dataset(task: Task, name: str, agents: dict[str, Path], folder: Path) -> Path:
+    """Steps of one behaviour, or a mixture of all three; ``random`` acts uniformly."""
+    kinds = {"random": ("medium", 1.0), "medium": ("medium", 0.0), "expert": ("expert", 0.0)}
+    if name == "mixed":
+        parts = []
+        for steps, (kind, (agent, share)) in zip(task.mixture, kinds.items(), strict=True):
+            to = folder / task.environment / f"part-{kind}-v0"
+            parts.append(td.record(agents[agent], steps=steps, random_share=share, seed=1, to=to).path)
+        return td.mix(*parts, to=folder / task.environment / "mixed-v0").path
+    agent, share = kinds[name]
+    to = folder / task.environment / f"{name}-v0"
+    return td.record(agents[agent], steps=sum(task.mixture), random_share=share, to=to).path
 
 
-def judge(agents: dict[str, Path], folder: Path) -> list[dict]:
-    """Estimates of the medium CartPole policy's worth from ten datasets of its noisy twin, beside the true worth."""
-    gamma, rows = 0.9, []
-    alone = td.record(agents["medium"], episodes=200, deterministic=True, seed=100, to=folder / "alone-v0")
+def score(task: Task, name: str, place: Path, folder: Path) -> dict:
+    """A dataset's own returns, and what each learner makes of it."""
+    data, learners = td.dataset(place), {}
+    for learner, settings in task.learners.items():
+        made = td.train(learner, str(place), steps=UPDATES, seeds=SEEDS, settings=SIZES | settings, output=folder / "runs")
+        found = td.load(made.run).evaluate(EPISODES)
+        learners[learner] = {part: getattr(found, part) for part in ("mean", "iqm", "min", "ci95", "per_seed")}
+        learners[learner] |= {"settings": SIZES | settings, "updates": UPDATES, "cpu_s": made.cpu_s}
+        print(f"{task.environment} {name} {learner}: {found.mean:.1f} ({made.cpu_s:.0f} CPU-s)", file=sys.stderr, flush=True)
+    facts = {"environment": task.environment, "dataset": name, "steps": len(data.reward), "episodes": len(data.lengths)}
+    return facts | {"behavior": float(data.returns.mean()), "best_episode": float(data.returns.max()), "learners": learners}
+
+
+def judge(agent: Path, folder: Path) -> dict:
+    """Estimates of the medium CartPole policy's worth from datasets of its noisy twin, beside the true worth."""
+    gamma, logs = 0.9, []
+    alone = td.record(agent, episodes=200, deterministic=True, seed=100, to=folder / "judged" / "alone-v0")
     true = discounted(alone, gamma).mean()
-    for seed in range(10):
-        data = td.record(agents["medium"], episodes=200, deterministic=True, random_share=0.2, seed=seed, to=folder / f"noisy-v{seed}")
-        found = td.evaluate_offline(agents["medium"], data, gamma=gamma, steps=3_000, seed=seed)
+    for seed in range(LOGS):
+        data = td.record(agent, episodes=200, deterministic=True, random_share=0.2, seed=seed, to=folder / "judged" / f"noisy-v{seed}")
+        found = td.evaluate_offline(agent, data, gamma=gamma, steps=2_000, seed=seed)
         estimates = {name: each.value for name, each in found.estimates.items()}
-        rows.append({"effective_episodes": found.effective_episodes, "behavior": found.behavior.value, "estimates": estimates})
+        logs.append({"effective_episodes": found.effective_episodes, "estimates": {"behavior": found.behavior.value, **estimates}})
+        print(logs[-1], file=sys.stderr, flush=True)
     errors = {}
-    for name in ("behavior", *rows[0]["estimates"]):
-        values = np.array([row["behavior"] if name == "behavior" else row["estimates"][name] for row in rows])
-        errors[name] = {"bias": float((values - true).mean()), "rmse": float(np.sqrt(np.square(values - true).mean()))}
-    return [{"environment": "CartPole-v1", "gamma": gamma, "true": float(true), "logs": rows, "errors": errors}]
+    for name in logs[0]["estimates"]:
+        off = np.array([row["estimates"][name] for row in logs]) - true
+        errors[name] = {"bias": float(off.mean()), "rmse": float(np.sqrt(np.square(off).mean()))}
+    return {"environment": "CartPole-v1", "gamma": gamma, "true": float(true), "logs": logs, "errors": errors}
 
 
 def discounted(data, gamma: float) -> np.ndarray:
@@ -124,18 +115,19 @@ def discounted(data, gamma: float) -> np.ndarray:
 
 def write_tables() -> None:
     content = json.loads(RESULTS.read_text())
-    lines = [
-        "| environment | dataset | its own return | " + " | ".join(["bc", "td3_bc", "iql", "cql"]) + " |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    names = ("bc", "td3_bc", "iql", "cql")
+    lines = [f"| environment | dataset | steps | its own return | {' | '.join(names)} |", "|---" * 8 + "|"]
     for row in content["learning"]:
-        cells = [cell(row["learners"].get(name)) for name in ("bc", "td3_bc", "iql", "cql")]
-        lines.append(f"| {row['environment']} | {row['dataset']} | {row['behavior']:.0f} | {' | '.join(cells)} |")
+        cells = [cell(row["learners"].get(name)) for name in names]
+        facts = f"{row['environment']} | {row['dataset']} | {row['steps']:,} | {row['behavior']:.0f}"
+        lines.append(f"| {facts} | {' | '.join(cells)} |")
     put("learning", lines)
-    for found in content["evaluation"]:
-        head = f"True value {found['true']:.3f} (gamma {found['gamma']}), ten datasets of 200 episodes:"
-        rows = [f"| {name} | {each['bias']:+.3f} | {each['rmse']:.3f} |" for name, each in found["errors"].items()]
-        put("evaluation", [head, "", "| estimate | bias | root mean squared error |", "|---|---|---|", *rows])
+    found = content["evaluation"]
+    head = (
+        f"{found['environment']}, true value {found['true']:.3f} (gamma {found['gamma']}), {len(found['logs'])} datasets of 200 episodes:"
+    )
+    rows = [f"| `{name}` | {each['bias']:+.3f} | {each['rmse']:.3f} |" for name, each in found["errors"].items()]
+    put("evaluation", [head, "", "| estimate | mean error | root mean squared error |", "|---|---|---|", *rows])
 
 
 def cell(found: dict | None) -> str:
@@ -152,21 +144,39 @@ def put(name: str, lines: list[str]) -> None:
     DOCS.write_text(f"{before}<!-- {name} -->\n" + "\n".join(lines) + f"\n<!-- end of {name} -->{after}")
 
 
+def keep(part: str, found: dict) -> None:
+    """Put a row, or the evaluation, into the results in place of an older one."""
+    content = json.loads(RESULTS.read_text()) if RESULTS.exists() else {"learning": [], "evaluation": {}}
+    content |= {"seeds": SEEDS, "episodes": EPISODES}
+    if part == "evaluation":
+        content["evaluation"] = found
+    else:
+        others = [row for row in content["learning"] if (row["environment"], row["dataset"]) != (found["environment"], found["dataset"])]
+        content["learning"] = sorted(
+            [*others, found], key=lambda row: (row["environment"] != "Pendulum-v1", DATASETS.index(row["dataset"]))
+        )
+    RESULTS.write_text(json.dumps(content, indent=1) + "\n")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("parts", nargs="*", default=["Pendulum-v1", "CartPole-v1", "evaluation"])
+    parser.add_argument("--datasets", nargs="*", default=DATASETS)
     parser.add_argument("--tables", action="store_true")
-    if parser.parse_args().tables:
+    options = parser.parse_args()
+    if options.tables:
         return write_tables()
-    learning, evaluation, begun = [], [], time.process_time()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for task in TASKS:
-            agents, places = make_datasets(task, folder)
-            if task.environment == "CartPole-v1":
-                evaluation = judge(agents, folder / "judged")
-            learning += score(task, places, folder)
-    content = {"seeds": SEEDS, "episodes": EPISODES, "cpu_s": time.process_time() - begun}
-    RESULTS.write_text(json.dumps(content | {"learning": learning, "evaluation": evaluation}, indent=1) + "\n")
+            judged = task.environment == "CartPole-v1" and "evaluation" in options.parts
+            if not judged and task.environment not in options.parts:
+                continue
+            agents = make_agents(task, folder)
+            if judged:
+                keep("evaluation", judge(agents["medium"], folder))
+            for dataset in options.datasets if task.environment in options.parts else ():
+                keep("learning", score(task, dataset, make_dataset(task, dataset, agents, folder), folder))
     return None
 
 

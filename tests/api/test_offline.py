@@ -114,6 +114,7 @@ def test_a_dataset_that_was_changed_is_not_gone_on_with(made, tmp_path):
         td.resume(run, steps=40)
 
 
+@pytest.mark.slow
 def test_awac_goes_on_online_with_its_networks_and_its_replay_filled(continuous, tmp_path):
     offline = td.train("awac", str(continuous.data.path), steps=20, settings=SMALL, output=tmp_path)
     settings = {"buffer_size": 400, "batch_size": 16}

@@ -223,7 +223,6 @@ def ppo(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) ->
         # The parameters as one vector: the optimiser is then a handful of kernels instead of a handful a layer (measured: 1.2x).
         flat, unravel = ravel_pytree(state.params)
         gradient = jax.value_and_grad(lambda v, rows: ppo_loss(unravel(v), rows, net, distribution, config, clip), has_aux=True)
-
         order = minibatches(key, items, config.n_epochs, per_minibatch)
         flat, opt_state, going, metrics = improve(
             flat, state.opt_state, batch, order, gradient, optimizer, rate, config.target_kl, sequences

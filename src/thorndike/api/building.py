@@ -13,6 +13,7 @@ from thorndike.algorithms import ALGORITHMS
 from thorndike.environments import registry, wrappers
 from thorndike.environments.native.vectorize import Dynamics
 from thorndike.errors import UserError
+from thorndike.learning_sources import check_source
 from thorndike.networks.network import NetworkBuilder
 from thorndike.networks.torso import is_image
 from thorndike.suggestions import did_you_mean
@@ -187,6 +188,7 @@ def build_job(
     """Bind a request to its environment, learner, source and runner; ``lanes`` are other agents than its seeds, with their own learner."""
     if request.dataset is not None:
         return _offline_job(request, network)
+    check_source(request.algorithm, request.environment)
     wrapper = wrappers.from_settings(request.wrappers) if given is None else wrappers.chain(*given)
     indices = range(request.seeds) if lanes is None else lanes.agents
     build = partial(build_algorithm, request.algorithm, request.config, network=network) if lanes is None else lanes.build

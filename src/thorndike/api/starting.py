@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from thorndike.api.building import Job, Request, build_job, recorded_data
+from thorndike.api.recorded_run import Objects, request_in
 from thorndike.environments import registry
 from thorndike.errors import UserError
 from thorndike.records import read_record
@@ -25,8 +26,7 @@ def offline_request(run: Path, algorithm: str, environment: str) -> Request:
 
     Raises ``UserError`` unless it is a run of the same algorithm on a dataset of the same environment.
     """
-    record = read_record(run)
-    request = Request(**{field: record[field] for field in Request._fields if field in record})  # type: ignore[arg-type]
+    request = request_in(read_record(run), run, Objects())
     if request.dataset is None or request.algorithm != algorithm:
         raise UserError(f"{run} is no run of {algorithm} on a dataset; make one: thorndike train {algorithm} DATASET")
     if request.environment != environment:
