@@ -21,7 +21,7 @@ from thorndike.training.datasets import episodes_of
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results" / "offline.json"
 DOCS = ROOT / "docs" / "offline.md"
-SEEDS, EPISODES, UPDATES, LOGS = 10, 10, 4_000, 10
+SEEDS, EPISODES, UPDATES, LOGS = 10, 10, 4_000, 5
 SIZES = {"net_arch": (64, 64), "batch_size": 128, "learning_rate": 1e-3}
 
 

@@ -14,7 +14,6 @@ from thorndike.training.json_files import (
     OBJECT,
     OBJECTS,
     TEXT,
-    TEXTS,
     Json,
     Kind,
     blamed_on,
@@ -55,7 +54,11 @@ _OF_RUN: Mapping[str, Kind] = {
     "device": TEXT,
     "processors": TEXT,
 }
-_OF_OFFLINE: Mapping[str, Kind] = {"dataset": optional(TEXTS), "start_from": optional(TEXT)}
+_DATASET = Kind(
+    "the path and the sha256 of a dataset",
+    lambda value: isinstance(value, dict) and set(value) == {"path", "sha256"} and all(map(TEXT.admits, value.values())),
+)
+_OF_OFFLINE: Mapping[str, Kind] = {"dataset": optional(_DATASET), "start_from": optional(TEXT)}
 _OF_POLICY: Mapping[str, Kind] = {**_SHARED, "observation_space": OBJECT, "action_space": OBJECT, "best": whole(0, _MOST)}
 
 

@@ -43,7 +43,6 @@ SECONDS = Kind(
 )
 NUMBER = Kind("a number", lambda value: type(value) in (int, float))
 OBJECT = Kind("an object", lambda value: isinstance(value, dict))
-TEXTS = Kind("an object of short texts", lambda value: isinstance(value, dict) and all(TEXT.admits(part) for part in value.values()))
 OBJECTS = Kind("a list of objects", lambda value: isinstance(value, list) and all(isinstance(part, dict) for part in value))
 
 
