@@ -21,7 +21,7 @@ from thorndike.training.recording import action_probabilities
 from thorndike.training.sources import from_environment
 from thorndike.types import Observation
 
-BATCH, TAU, LEARNING_RATE = 256, 0.01, 1e-3
+BATCH, TAU, LEARNING_RATE = 256, 0.05, 1e-3
 DRAWS = 8
 """Actions of a stochastic Box policy that stand for it in each state."""
 _CHUNK = 4_096
