@@ -102,7 +102,7 @@ class EnvSpec(NamedTuple):
     num_envs: int
     max_episode_steps: int | None = None
     engine: str = "native"
-    """``native`` (compiled), ``gymnasium``, ``subprocess``, ``envpool`` or ``ale``."""
+    """``native`` (compiled), ``gymnasium``, ``subprocess``, ``envpool`` or ``ale``; ``dataset`` where nothing is stepped."""
     num_agents: int = 1
     can_vmap: bool = True
     can_restore: bool = True
@@ -136,6 +136,8 @@ class Needs(NamedTuple):
     on_policy: bool
     warmup_iterations: int = 0
     """Iterations that only ``observe`` before learning starts."""
+    batch_size: int = 1
+    """Transitions that a dataset gives side by side: its rollouts are ``[rollout_length, batch_size]``, a row an update."""
 
 
 class Algorithm(NamedTuple):
@@ -160,6 +162,8 @@ class Algorithm(NamedTuple):
     observe: Callable[[PyTree, Rollout, Key[Array, ""]], tuple[PyTree, Metrics]]
     """The same signature: store only, no learning (the warm-up segment)."""
     needs: Needs
+    probabilities: Callable[[PyTree, PyTree, Observation], Float[Array, "*batch actions"]] | None = None
+    """Actor, memory, obs -> the probability of each Discrete action under ``act``; None where it is not known."""
 
 
 def _as_they_are(statistics: PyTree, key: Key[Array, ""]) -> PyTree:

@@ -9,14 +9,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from made_up_data import BOX, DISCRETE, made_up
 from thorndike.algorithms import (
     a2c,
     a3c,
+    awac,
+    bc,
     bootstrapped_dqn,
+    cql,
     crossq,
     ddpg,
     dqn,
     impala,
+    iql,
     iqn,
     ppo,
     pqn,
@@ -27,6 +32,7 @@ from thorndike.algorithms import (
     reinforce,
     sac,
     td3,
+    td3_bc,
     tqc,
     trpo,
 )
@@ -36,6 +42,7 @@ from thorndike.environments.native.vectorize import vectorize
 from thorndike.networks.torso import example_observation
 from thorndike.training import runner as runner_module
 from thorndike.training.checkpoints import Progressed, restore, save_checkpoint
+from thorndike.training.dataset_source import dataset_source, dataset_spec
 from thorndike.training.policy import Policy
 from thorndike.training.run_directory import checkpoints
 from thorndike.training.runner import Carry, Runner, runner
@@ -74,6 +81,22 @@ class Case(NamedTuple):
         return algorithm, compiled_source(environment, algorithm, wrapper)
 
 
+class DataCase(NamedTuple):
+    """A learner from a dataset."""
+
+    build: object
+    config: object
+    space: object
+
+    def make(self) -> tuple[Algorithm, Source]:
+        data = made_up(self.space)
+        algorithm = self.build(self.config, dataset_spec(data))
+        return algorithm, dataset_source(data, algorithm)
+
+
+DATA = {"total_steps": 1000, "batch_size": 8, "net_arch": (8,)}
+
+
 def parts(config, **changes):
     return dataclasses.replace(config, **changes)
 
@@ -100,6 +123,9 @@ RUN = {
     "bootstrapped_dqn": Case(bootstrapped_dqn.bootstrapped_dqn, bootstrapped_dqn.Config(**OF_THE_FAMILY, n_members=3), "CartPole-v1"),
     "ppo, bonuses": Case(ppo.ppo, PPO, "CartPole-v1", NEW),
     "q_learning": Case(q_learning.q_learning, parts(TABLE, variant="sarsa"), "MountainCar-v0", BINS),
+    "iql": DataCase(iql.iql, iql.Config(**DATA, learning_rate="linear(1e-3, 0)"), DISCRETE),
+    "td3_bc": DataCase(td3_bc.td3_bc, td3_bc.Config(**DATA), BOX),
+    "cql, Box": DataCase(cql.cql, cql.Config(**DATA, n_actions=2), BOX),
 }
 ALL = RUN | {
     "sac, one update a step": Case(sac.sac, sac.Config(**CONTROL | {"train_freq": 4, "gradient_steps": 1}), "Pendulum-v1", NORMALISED),
@@ -107,6 +133,12 @@ ALL = RUN | {
     "sac, held noise": Case(sac.sac, sac.Config(**CONTROL, use_sde=True), "Pendulum-v1"),
     "ppo, Box, held noise, gru": Case(ppo.ppo, parts(PPO, use_sde=True, memory="gru", memory_size=8), "Pendulum-v1"),
     "ppo, Box, beta": Case(ppo.ppo, parts(PPO, action_distribution="beta"), "Pendulum-v1"),
+    "bc": DataCase(bc.bc, bc.Config(**DATA), DISCRETE),
+    "bc, Box": DataCase(bc.bc, bc.Config(**DATA), BOX),
+    "iql, Box": DataCase(iql.iql, iql.Config(**DATA), BOX),
+    "cql": DataCase(cql.cql, cql.Config(**DATA), DISCRETE),
+    "awac": DataCase(awac.awac, awac.Config(**DATA), BOX),
+    "awac, online": Case(awac.awac, awac.Config(**CONTROL), "Pendulum-v1"),
     "ddpg": Case(ddpg.ddpg, ddpg.Config(**CONTROL), "Pendulum-v1"),
     "tqc": Case(tqc.tqc, tqc.Config(**CONTROL, n_quantiles=5), "Pendulum-v1"),
     "redq": Case(redq.redq, redq.Config(**CONTROL | {"gradient_steps": 4}, policy_delay=4), "Pendulum-v1"),
@@ -194,7 +226,7 @@ class Bound(NamedTuple):
     traces: list[str]
 
 
-SLOW = ("ppo, bonuses", "dqn, hindsight", "td3", "crossq", "dqn, lstm", "a2c, gru", "a3c, gru", "trpo", "pqn")
+SLOW = ("ppo, bonuses", "dqn, hindsight", "td3", "crossq", "dqn, lstm", "a2c, gru", "a3c, gru", "trpo", "pqn", "td3_bc", "cql, Box")
 """Cases whose machinery another one runs too."""
 
 

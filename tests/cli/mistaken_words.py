@@ -19,8 +19,9 @@ class Mistake(NamedTuple):
     words: list[str]
 
 
-OF_RUNS = ("show", "eval", "watch", "resume", "reproduce", "plot", "compare")
+OF_RUNS = ("show", "eval", "watch", "resume", "reproduce", "plot", "compare", "record")
 TRAINED = ("ppo", "a2c", "reinforce", "dqn", "q_learning")
+FROM_DATA = ("bc", "cql", "iql", "td3_bc")
 FLAGS = {
     "train": [
         "--steps",
@@ -35,6 +36,8 @@ FLAGS = {
     ],
     "bench": ["--steps", "--seeds", "--seed", "--num-envs", "--repeat"],
     "eval": ["--episodes", "--seed", "--num-envs"],
+    "record": ["--episodes", "--steps", "--seed"],
+    "ope": ["--seed", "--fqe-steps"],
     "watch": ["--episodes", "--seed"],
     "resume": ["--steps", "-n"],
     "reproduce": ["--steps"],
@@ -59,7 +62,7 @@ OTHER_FLAGS = [
     "metric",
 ]
 OTHER_FLAGS += ["against", "failed-below", "plot", "file", "title", "video", "window", "stochastic", "eval-episodes", "n-timesteps"]
-OTHER_FLAGS += ["total-steps"]
+OTHER_FLAGS += ["total-steps", "start-from", "deterministic", "random-share", "to", "data", "methods", "gamma", "fqe-steps"]
 NO_NUMBERS = [
     "",
     " ",
@@ -291,6 +294,8 @@ def sound(chance: random.Random, verb: str) -> list[str]:
         return [verb, "no-run", "no-other-run"]
     if verb in OF_RUNS:
         return [verb, "no-run"]
+    if verb == "ope":
+        return [verb, "no-run", "--data", "empty"]
     return {"check-env": [verb, chance.choice(IDS)], "list": [verb, "algorithms"], "info": [verb]}.get(verb, [verb])
 
 
@@ -528,6 +533,15 @@ def wrong_form(chance: random.Random, place: Path) -> list[str]:
                 unlike(chance, lambda word: word in ("runs", "algorithms", "environments", "presets", "settings"), ["runs", "presets"]),
             ],
             ["info", "--steps", "5"],
+            ["record", "no-run", "--random-share", chance.choice(["-0.1", "1.5", "x", "nan", "inf", ""])],
+            ["record", "no-run", "--episodes", "5", "--steps", "5"],
+            ["record", "no-run", "--to", chance.choice(["empty", "text.txt", "twins"])],
+            ["ope", "no-run"],
+            ["ope", "no-run", "--data", chance.choice(["empty", "missing", "text.txt", "CartPole-v1"])],
+            ["ope", "no-run", "--data", "empty", "--methods", chance.choice(["x", "", "fqe,", "pdis dr", "WIS"])],
+            ["ope", "no-run", "--data", "empty", "--gamma", chance.choice(["1", "-1", "x", "2"])],
+            ["train", chance.choice(FROM_DATA), chance.choice(["CartPole-v1", "Pendulum-v1", "empty", "missing/data"])],
+            ["train", "awac", "Pendulum-v1", "--start-from", chance.choice(["no-run", "empty"])],
             ["train", "dqn", chance.choice(["Pendulum-v1", "MountainCarContinuous-v0"])],
             ["train", "q_learning", chance.choice(["Pendulum-v1", "MountainCarContinuous-v0"])],
             ["train", "planning", chance.choice(["CartPole-v1", "Pendulum-v1"])],

@@ -16,6 +16,8 @@ class Entry(NamedTuple):
     """Whether it learns in a table, without a network: masks and images are nothing to it."""
     network: bool = True
     """Whether a network of the user's own can take the place of its own."""
+    learns_from: tuple[str, ...] = ("environment",)
+    """``environment``, ``dataset``, or both."""
 
 
 ALGORITHMS: dict[str, Entry] = {
@@ -75,6 +77,41 @@ ALGORITHMS: dict[str, Entry] = {
     ),
     "redq": Entry(
         "thorndike.algorithms.redq", "SAC with ten critics and twenty updates a step: fewest steps; Box actions", ("Box",), num_envs=1
+    ),
+    "bc": Entry(
+        "thorndike.algorithms.bc",
+        "Behaviour cloning of a dataset, the baseline of offline learning; Discrete and Box actions",
+        ("Discrete", "Box"),
+        num_envs=1,
+        learns_from=("dataset",),
+    ),
+    "cql": Entry(
+        "thorndike.algorithms.cql",
+        "Conservative Q-learning from a dataset; Discrete and Box actions",
+        ("Discrete", "Box"),
+        num_envs=1,
+        learns_from=("dataset",),
+    ),
+    "iql": Entry(
+        "thorndike.algorithms.iql",
+        "Implicit Q-learning from a dataset: asks of no action outside of it; Discrete and Box actions",
+        ("Discrete", "Box"),
+        num_envs=1,
+        learns_from=("dataset",),
+    ),
+    "td3_bc": Entry(
+        "thorndike.algorithms.td3_bc",
+        "TD3 from a dataset, kept near its actions; Box actions",
+        ("Box",),
+        num_envs=1,
+        learns_from=("dataset",),
+    ),
+    "awac": Entry(
+        "thorndike.algorithms.awac",
+        "Advantage-weighted actor-critic: from a dataset, and online from there; Box actions",
+        ("Box",),
+        num_envs=1,
+        learns_from=("dataset", "environment"),
     ),
     "q_learning": Entry(
         "thorndike.algorithms.q_learning",

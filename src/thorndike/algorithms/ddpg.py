@@ -14,10 +14,11 @@ Logs what TD3 logs. Results and their commands: docs/algorithms/ddpg.md.
 from dataclasses import dataclass
 from typing import Annotated
 
-from thorndike.algorithms.td3 import Parts, deterministic_actor_critic
+from thorndike.algorithms.td3 import Parts, climb, deterministic_actor_critic
 from thorndike.networks.network import NetworkBuilder
 from thorndike.networks.torso import ACTIVATIONS
 from thorndike.replay.hindsight import STRATEGIES
+from thorndike.replay.off_policy import off_policy
 from thorndike.settings import AtLeast, Between, OneOf, check
 from thorndike.types import Algorithm, EnvSpec
 
@@ -49,6 +50,12 @@ class Config:
 def ddpg(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) -> Algorithm:
     """DDPG for an environment with Box actions. Raises ``UserError`` for other action spaces."""
     parts = Parts(
-        tau=config.tau, n_critics=1, policy_delay=1, target_policy_noise=0.0, target_noise_clip=0.0, action_noise=config.action_noise
+        tau=config.tau,
+        n_critics=1,
+        policy_delay=1,
+        target_policy_noise=0.0,
+        target_noise_clip=0.0,
+        action_noise=config.action_noise,
+        objective=climb,
     )
-    return deterministic_actor_critic("ddpg", config, parts, spec, network)
+    return off_policy(deterministic_actor_critic("ddpg", config, parts, spec, network), config, spec)

@@ -39,7 +39,7 @@ from thorndike.functional.returns import generalized_advantage
 from thorndike.functional.schedules import schedule
 from thorndike.functional.shuffling import minibatch_size, minibatches
 from thorndike.networks.cnn import CNNS
-from thorndike.networks.heads import Shape, stochastic_policy
+from thorndike.networks.heads import Shape, softmax_probabilities, stochastic_policy
 from thorndike.networks.network import Network, NetworkBuilder, apply_rollout, apply_step, as_rows, begins_episode, fresh_memory
 from thorndike.networks.recurrent import MEMORIES
 from thorndike.networks.torso import ACTIVATIONS, example_observation
@@ -243,5 +243,6 @@ def ppo(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) ->
         update=update,
         observe=lambda state, rollout, key: (state, {}),
         needs=Needs(rollout_length=config.n_steps, on_policy=True),
+        probabilities=softmax_probabilities(net, spec.action_space),
     )
     return with_held_noise(algorithm, config.sde_sample_freq) if config.use_sde else algorithm

@@ -10,8 +10,9 @@ Logs ``train/actor_loss``, ``critic_loss``, ``q_mean``, ``actor_grad_norm``, ``c
 commands: docs/algorithms/td3.md.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, NamedTuple
+from typing import Annotated, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +26,7 @@ from thorndike.networks.continuous import box_dimensions, critics, policy_output
 from thorndike.networks.network import NetworkBuilder
 from thorndike.networks.torso import ACTIVATIONS
 from thorndike.replay.hindsight import STRATEGIES
-from thorndike.replay.off_policy import Method, Settings, off_policy
+from thorndike.replay.off_policy import Method, off_policy
 from thorndike.replay.uniform import Transitions
 from thorndike.settings import AtLeast, Between, OneOf, check
 from thorndike.types import Algorithm, EnvSpec, Metrics, Number, Observation
@@ -91,9 +92,32 @@ class Parts(NamedTuple):
     target_policy_noise: Number
     target_noise_clip: Number
     action_noise: Number
+    objective: Callable[[Float[Array, " M"], Float[Array, "M D"], Transitions], Float[Array, ""]]
+    """Q of the policy's actions, those actions, the minibatch -> what the policy descends."""
 
 
-def deterministic_actor_critic(name: str, config: Settings, parts: Parts, spec: EnvSpec, network: NetworkBuilder | None) -> Algorithm:
+class Sizes(Protocol):
+    """The settings that the networks and minibatches are made by."""
+
+    @property
+    def batch_size(self) -> int:
+        """Transitions of a minibatch."""
+
+    @property
+    def net_arch(self) -> tuple[int, ...]:
+        """Widths of the hidden layers."""
+
+    @property
+    def activation(self) -> str:
+        """After each hidden layer."""
+
+
+def climb(q: Float[Array, " M"], action: Float[Array, "M D"], batch: Transitions) -> Float[Array, ""]:
+    """TD3's own objective: the first critic's value, with its sign turned."""
+    return -weighted_mean(q, batch.weight)
+
+
+def deterministic_actor_critic(name: str, config: Sizes, parts: Parts, spec: EnvSpec, network: NetworkBuilder | None) -> Method:
     """A learner with a deterministic policy, from its parts. Raises ``UserError`` unless actions are a Box."""
     dimensions = box_dimensions(name, spec)
     outputs, init_policy = policy_outputs(spec, dimensions, config.net_arch, config.activation, network)
@@ -113,7 +137,8 @@ def deterministic_actor_critic(name: str, config: Settings, parts: Parts, spec: 
         return squared_errors(values, target, batch.weight), jnp.mean(values)
 
     def policy_loss(params: Float[Array, " P"], judges: Float[Array, "K P"], batch: Transitions) -> Float[Array, ""]:
-        return -weighted_mean(net.apply(judges[:1], batch.obs, policy(params, batch.obs))[0, :, 0], batch.weight)
+        action = policy(params, batch.obs)
+        return parts.objective(net.apply(judges[:1], batch.obs, action)[0, :, 0], action, batch)
 
     def learn(learnt: Learnt, batch: Transitions, noise: Float[Array, "M D"], rate: Array, number: Array) -> tuple[Learnt, Metrics]:
         clip = parts.target_noise_clip
@@ -134,7 +159,7 @@ def deterministic_actor_critic(name: str, config: Settings, parts: Parts, spec: 
         metrics |= {"train/critic_loss": loss, "train/q_mean": q_mean, "train/critic_grad_norm": norm}
         return Learnt(better, judged), metrics
 
-    method = Method(
+    return Method(
         name=name,
         dimensions=dimensions,
         init=init,
@@ -145,7 +170,6 @@ def deterministic_actor_critic(name: str, config: Settings, parts: Parts, spec: 
         draw=lambda key, updates: jax.random.normal(key, (updates, config.batch_size, dimensions)),
         learn=learn,
     )
-    return off_policy(method, config, spec)
 
 
 def td3(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) -> Algorithm:
@@ -157,5 +181,6 @@ def td3(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) ->
         target_policy_noise=config.target_policy_noise,
         target_noise_clip=config.target_noise_clip,
         action_noise=config.action_noise,
+        objective=climb,
     )
-    return deterministic_actor_critic("td3", config, parts, spec, network)
+    return off_policy(deterministic_actor_critic("td3", config, parts, spec, network), config, spec)

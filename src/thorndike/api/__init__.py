@@ -2,6 +2,7 @@
 
 from thorndike.api.building import make
 from thorndike.api.comparing import Comparison, compare
+from thorndike.api.evaluating_offline import OfflineEvaluation, evaluate_offline
 from thorndike.api.learners import (
     A2C,
     A3C,
@@ -26,6 +27,7 @@ from thorndike.api.learners import (
 )
 from thorndike.api.loading import LoadedPolicy, load
 from thorndike.api.loading import evaluate_run as evaluate
+from thorndike.api.recording import dataset, mix, record
 from thorndike.api.reproducing import Reproduction, reproduce
 from thorndike.api.sweeping import Sweep, resume_sweep, sweep
 from thorndike.api.training import resume, runs, train
@@ -52,15 +54,20 @@ __all__ = [
     "CrossQ",
     "Learner",
     "LoadedPolicy",
+    "OfflineEvaluation",
     "QLearning",
     "Rainbow",
     "Reproduction",
     "Result",
     "Sweep",
     "compare",
+    "dataset",
     "evaluate",
+    "evaluate_offline",
     "load",
     "make",
+    "mix",
+    "record",
     "reproduce",
     "resume",
     "resume_sweep",

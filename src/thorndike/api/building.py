@@ -15,11 +15,14 @@ from thorndike.algorithms import ALGORITHMS
 from thorndike.environments import registry, wrappers
 from thorndike.environments.native.vectorize import Dynamics
 from thorndike.errors import UserError
+from thorndike.learning_sources import check_source
 from thorndike.networks.network import NetworkBuilder
 from thorndike.networks.torso import is_image
 from thorndike.replay.hindsight import goal_of
 from thorndike.suggestions import did_you_mean
 from thorndike.training.actor_threads import SCHEDULES, ActorThreads, threaded_source
+from thorndike.training.dataset_source import ENGINE, dataset_source, dataset_spec
+from thorndike.training.datasets import Dataset, read_dataset
 from thorndike.training.devices import devices_for
 from thorndike.training.host_source import HostEngine, HostSource, host_source
 from thorndike.training.json_files import TEXT, Kind, check_fields, whole
@@ -63,6 +66,10 @@ class Request(NamedTuple):
     checkpoint_every: int
     actors: dict[str, object] | None = None
     """``ActorThreads`` that play while the learner learns, if there are any."""
+    dataset: dict[str, str] | None = None
+    """``path`` and ``sha256`` of what is learnt from, where no environment is stepped; an update is then a step."""
+    start_from: str | None = None
+    """The offline run whose networks and dataset it began with."""
 
 
 class Lanes(NamedTuple):
@@ -174,6 +181,8 @@ def full_request(
     seed: int,
     checkpoint_every: int | None,
     actors: ActorThreads = NO_THREADS,
+    data: Dataset | None = None,
+    start_from: str | None = None,
 ) -> Request:
     """What was asked for, and what the preset and the defaults add to it."""
     check_actors(algorithm, choice, actors)
@@ -183,17 +192,19 @@ def full_request(
         environment=choice.id,
         env_kwargs=dict(choice.env_kwargs),
         max_episode_steps=choice.max_episode_steps,
-        engine=choice.engine,
+        engine=choice.engine if data is None else ENGINE,
         config=full_config(algorithm, {**preset.settings, **settings, "total_steps": steps}),
         wrappers=list(preset.wrappers) if given is None else [wrapper.settings for wrapper in given],
         preset=preset.name,
         steps=steps,
         seeds=seeds,
         seed=seed,
-        num_envs=num_envs or preset.num_envs or ALGORITHMS[algorithm].num_envs,
+        num_envs=1 if data is not None else num_envs or preset.num_envs or ALGORITHMS[algorithm].num_envs,
         log_every=math.ceil(steps / LOG_POINTS),
         checkpoint_every=checkpoint_every or math.ceil(steps / CHECKPOINTS),
         actors=actors._asdict() if actors.threads else None,
+        dataset=None if data is None else {"path": str(data.path.absolute()), "sha256": data.sha256},
+        start_from=start_from,
     )
 
 
@@ -231,6 +242,9 @@ def build_job(
 
     On compiled environments at most ``devices`` share the agents.
     """
+    if request.dataset is not None:
+        return _offline_job(request, network)
+    check_source(request.algorithm, request.environment)
     wrapper = wrappers.from_settings(request.wrappers) if given is None else wrappers.chain(*given)
     indices = range(request.seeds) if lanes is None else lanes.agents
     build = partial(build_algorithm, request.algorithm, request.config, network=network) if lanes is None else lanes.build
@@ -293,6 +307,22 @@ def _on_host(
     return spec, threaded.source, algorithm, plan, threaded.close
 
 
+def recorded_data(dataset: Mapping[str, str]) -> Dataset:
+    """The dataset that a request names. Raises ``UserError`` if it is not what it was."""
+    data = read_dataset(dataset["path"])
+    if data.sha256 != dataset["sha256"]:
+        raise UserError(f"{data.path} was changed since the run began; put it back, or train a new run on it")
+    return data
+
+
+def _offline_job(request: Request, network: NetworkBuilder | None) -> Job:
+    data, wrapper = recorded_data(request.dataset or {}), wrappers.chain()
+    spec = dataset_spec(data)
+    algorithm, plan = _learner(request, spec, wrapper, partial(build_algorithm, request.algorithm, request.config, network=network))
+    source = dataset_source(data, algorithm)
+    return Job(request, algorithm, wrapper, spec, source, runner(algorithm, source, request.seed, range(request.seeds)), plan, _nothing)
+
+
 def is_large(request_algorithm: str, choice: registry.Choice) -> bool:
     """Whether the run is large enough for an accelerator: images, that is convolutions."""
     if ALGORITHMS[request_algorithm].tabular or choice.engine == "native":
@@ -321,7 +351,7 @@ def _learner(request: Request, spec: EnvSpec, wrapper: Wrapper, build: Callable[
     page = page_length(algorithm, request.num_envs)
     if plan.log_every > page:
         plan = plan._replace(log_every=math.ceil(plan.log_every / page) * page)
-    if request.engine != "native":
+    if request.engine not in ("native", ENGINE):
         # Host environments start afresh at checkpoints; a run ends at one, so that a longer run passes through the same states.
         plan = plan._replace(iterations=math.ceil(plan.iterations / plan.checkpoint_every) * plan.checkpoint_every)
     return algorithm, plan

@@ -48,6 +48,11 @@ class LoadedPolicy:
         return described(self.facts["environment"], self.facts["env_kwargs"])
 
     @property
+    def policy(self) -> Policy:
+        """The policy by itself, without its environment."""
+        return self._policy
+
+    @property
     def seeds(self) -> Sequence["LoadedPolicy"]:
         """Each agent as a policy of its own."""
         return [LoadedPolicy(policy, self.facts, self._environment) for policy in self._policy.seeds]
@@ -57,7 +62,7 @@ class LoadedPolicy:
 
         An environment without a time limit gets one of ``LONGEST_EPISODE`` steps.
         """
-        build = reference_engines(self._choice(), self._policy.spec.observation_space)
+        build = reference_engines(self.choice(), self._policy.spec.observation_space)
         found = evaluate(self._policy, build, episodes, seed, num_envs or 20, deterministic)
         if self.run is not None:
             settings = {"evaluation_seed": seed, "deterministic": deterministic}
@@ -68,10 +73,11 @@ class LoadedPolicy:
 
     def watch(self, path: str | Path | None = None, episodes: int = 1, seed: int = 0) -> Path | None:
         """Film episodes of the policy as mp4, or show them in a window if no path is given."""
-        choice = self._choice()
+        choice = self.choice()
         return film(self._policy, _maker(choice, self._policy.spec.observation_space), None if path is None else Path(path), episodes, seed)
 
-    def _choice(self) -> registry.Choice:
+    def choice(self) -> registry.Choice:
+        """The environment that the policy is evaluated on. Raises ``UserError`` if it is an object that was not given."""
         if self._environment is None and self.facts["environment_object"]:
             raise UserError(f"{self.run} was trained on an environment object: load it with td.load(run, environment=...)")
         if self._environment is None and self.run is not None:

@@ -29,6 +29,7 @@ class Objects(NamedTuple):
 
 def request_in(record: Json, run: Path, objects: Objects) -> Request:
     """The request that a record holds. Raises ``UserError`` if it cannot be, or an object is needed again."""
+    # Runs of older versions know of no datasets.
     request = Request(**{field: record[field] for field in Request._fields if field in record})  # type: ignore[arg-type]
     if record["network"] == "user" and objects.network is None:
         raise UserError(f"{run} was trained with a network of your own; go on in Python, with network=...")
@@ -56,7 +57,7 @@ def rebuild(record: Json, request: Request, run: Path, objects: Objects, env_tim
     with blamed_on(run / "run.json"):
         choice = registry.resolve(
             request.environment if objects.environment is None else objects.environment,
-            engine=request.engine,
+            engine="auto" if request.dataset else request.engine,
             env_kwargs=request.env_kwargs,
             max_episode_steps=request.max_episode_steps,
         )

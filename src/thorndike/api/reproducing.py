@@ -12,6 +12,7 @@ import numpy as np
 
 from thorndike.api.building import EnvironmentLike, Job
 from thorndike.api.recorded_run import Objects, rebuild, request_in
+from thorndike.api.starting import first_carry
 from thorndike.errors import UserError
 from thorndike.networks.network import NetworkBuilder
 from thorndike.records import read_record
@@ -75,7 +76,7 @@ def reproduce(
         keeping = Keeping(comparison.compare, _nothing)
         try:
             with Progress(comparison.steps[-1], progress) as bar:
-                outcome = run_session(Path(folder), job.runner, job.source, plan, Start(job.runner.init()), keeping, bar)
+                outcome = run_session(Path(folder), job.runner, job.source, plan, Start(first_carry(job)), keeping, bar)
         except _Differs as difference:
             return comparison.result(str(difference))
     if outcome.signal is not None:

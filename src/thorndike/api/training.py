@@ -21,12 +21,15 @@ from thorndike.api.building import (
 from thorndike.api.exporting import export_policy
 from thorndike.api.planning import plan_run
 from thorndike.api.recorded_run import Objects, rebuild, request_in
+from thorndike.api.starting import first_carry, offline_request
 from thorndike.api.training_result import Result
 from thorndike.errors import UserError
+from thorndike.learning_sources import check_source, is_dataset
 from thorndike.networks.network import NetworkBuilder
 from thorndike.records import read_record
 from thorndike.training.actor_threads import ActorThreads
 from thorndike.training.checkpoints import restore, save_checkpoint
+from thorndike.training.datasets import read_dataset
 from thorndike.training.faults import locate
 from thorndike.training.json_files import Json
 from thorndike.training.metrics import last_points
@@ -37,6 +40,9 @@ from thorndike.training.run_lock import run_lock
 from thorndike.training.runner import Stopwatch
 from thorndike.training.session import RECENT, Keeping, NotFinite, Outcome, Start, run_session
 from thorndike.types import Wrapper
+
+SHAPES = ("net_arch", "activation")
+"""The settings that the sizes of networks follow from."""
 
 
 def train(
@@ -63,10 +69,14 @@ def train(
     actor_threads: int = 0,
     actor_schedule: str = "fixed",
     env_restarts: int = 0,
+    start_from: str | Path | None = None,
     progress: bool = False,
     command: str | None = None,
 ) -> Result:
     """Train ``seeds`` independent agents and keep everything in a new run directory.
+
+    ``environment`` may be the folder of a dataset: a learner from data then makes ``steps`` updates, and is evaluated on the
+    environment that the dataset names. ``start_from`` is such a run, whose networks and dataset an online one begins with.
 
     ``steps`` are environment steps of each seed. What is not given comes from the environment's preset, then from the algorithm's
     defaults; ``preset="none"`` ignores presets. ``wrappers`` are those of ``thorndike.environments.wrappers``; ``network`` builds a
@@ -79,12 +89,25 @@ def train(
     check_algorithm(algorithm)
     if not 0 <= seed < 2**32 or seeds < 1:
         raise UserError(f"a seed is a number from 0 to 2^32 - 1, and there is at least one; got seed={seed}, seeds={seeds}")
+    check_source(algorithm, environment)
+    data = read_dataset(str(environment)) if is_dataset(environment) else None
+    if data is not None:
+        refuse_stepping(num_envs, engine, wrappers, env_kwargs, max_episode_steps, start_from)
+        environment, env_kwargs, max_episode_steps = data.origin[:3]
     choice, found = choose(algorithm, environment, preset, engine, env_kwargs, max_episode_steps)
     if algorithm == "planning":
         return plan_run(choice, settings or {}, output, name, command)
+    settings, started = dict(settings or {}), None
+    if start_from is not None:
+        # Networks of the same size, unless they are asked for; what acts knows already how, so that nothing is drawn at random first.
+        before, started = offline_request(Path(start_from), algorithm, choice.id), str(Path(start_from).absolute())
+        settings = {name: before.config[name] for name in SHAPES} | {"learning_starts": 0} | settings
     actors = ActorThreads(actor_threads, actor_schedule, env_restarts)
-    request = full_request(algorithm, choice, found, wrappers, settings or {}, steps, num_envs, seeds, seed, checkpoint_every, actors)
-    prepare_devices(choice, seeds, devices)
+    request = full_request(
+        algorithm, choice, found, wrappers, settings, steps, num_envs, seeds, seed, checkpoint_every, actors, data, started
+    )
+    if data is None:
+        prepare_devices(choice, seeds, devices)
     backend = startup.choose_device(device, is_large(algorithm, choice))
     job = build_job(request, choice, wrappers, network, env_timeout, devices=startup.device_count(devices))
     run = new_run_directory(output, choice.id, algorithm, name)
@@ -92,7 +115,7 @@ def train(
     record = {**facts(), "status": "running", "command": command, "device": backend, **objects, **as_json(request)}
     with closing(job), run_lock(run):
         _begin_record(run, record)
-        return _conduct(run, record, job, progress, lambda: Start(job.runner.init()))
+        return _conduct(run, record, job, progress, lambda: Start(first_carry(job)))
 
 
 def resume(
@@ -133,6 +156,22 @@ def runs(output: str | Path = "runs") -> list[Path]:
     return sorted((path.parent for path in Path(output).glob("*/*/*/run.json")), key=lambda path: path.name)
 
 
+def refuse_stepping(
+    num_envs: int | None,
+    engine: str,
+    wrappers: Sequence[Wrapper] | None,
+    env_kwargs: Mapping[str, object] | None,
+    max_episode_steps: int | None,
+    start_from: str | Path | None,
+) -> None:
+    """Raises ``UserError`` for what has no meaning where no environment is stepped, rather than leave it out."""
+    given: dict[str, object] = {"num_envs": num_envs, "wrappers": wrappers, "env_kwargs": env_kwargs, "start_from": start_from}
+    given |= {"max_episode_steps": max_episode_steps, "engine": engine if engine != "auto" else None}
+    for name, value in given.items():
+        if value:
+            raise UserError(f"a dataset is as it was recorded, and no environment is stepped: leave {name} out")
+
+
 def _conduct(run: Path, record: Json, job: Job, progress: bool, begin: Callable[[], Start]) -> Result:
     """Run the session; whatever happens, ``run.json`` says how it ended."""
     spent = Stopwatch()
@@ -164,7 +203,7 @@ def _explained(run: Path, job: Job, error: NotFinite) -> str:
     """The error, with the first culprit found again from the last checkpoint where the engine can repeat itself."""
     if job.runner.inspect is None:
         return str(error)
-    carry, first = job.runner.init(), 0
+    carry, first = first_carry(job), 0
     if checkpoints(run):
         carry, progressed = restore(run, job.runner, job.source, as_json(job.request))
         first = progressed.iteration
@@ -191,7 +230,7 @@ def _restored(run: Path, job: Job) -> Start:
     if not checkpoints(run):
         notice(f"{run} was stopped before its first checkpoint: it begins again")
         truncate_lines(run / "metrics.jsonl", 0)
-        return Start(job.runner.init())
+        return Start(first_carry(job))
     carry, progressed = restore(run, job.runner, job.source, as_json(job.request))
     return Start(carry, progressed, last_points(run, RECENT, job.request.seeds))
 

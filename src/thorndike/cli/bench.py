@@ -16,6 +16,7 @@ from thorndike.cli.train import (
     named_algorithm,
     names,
 )
+from thorndike.learning_sources import check_source
 from thorndike.settings import read_config_fields
 
 EXAMPLES = """\
@@ -32,6 +33,7 @@ def run(words: Sequence[str]) -> Answer:
     options = parser.parse(words)
     algorithm, environment = names(options)
     settings, env_kwargs = given_settings(options, algorithm), given_env_kwargs(options.env_set)
+    check_source(algorithm, environment)
     check_environment(
         environment,
         engine=options.engine,

@@ -26,6 +26,8 @@ VERBS: dict[str, Verb] = {
     "resume": Verb("thorndike.cli.resume", "RUN", "go on with a run that stopped, bit for bit, or for more steps"),
     "reproduce": Verb("thorndike.cli.reproduce", "RUN", "make a run again and compare it, bit for bit"),
     "eval": Verb("thorndike.cli.evaluate", "RUN", "score a trained policy on fresh reference environments"),
+    "record": Verb("thorndike.cli.record", "RUN", "write down what a trained policy does, as a dataset"),
+    "ope": Verb("thorndike.cli.ope", "RUN --data DATASET", "say what a policy is worth from episodes that others made"),
     "watch": Verb("thorndike.cli.watch", "RUN", "film a trained policy as mp4, or show it in a window"),
     "plot": Verb("thorndike.cli.plot", "RUN...", "draw learning curves with their 95 % interval"),
     "sweep": Verb("thorndike.cli.sweep", "ALGORITHM ENVIRONMENT", "search settings, say which matter, rerun the best on fresh seeds"),

@@ -14,6 +14,7 @@ from thorndike.cli.parser import Parser, positive_whole
 from thorndike.cli.tables import table, text_of
 from thorndike.cli.train import add_training_arguments, check_output, check_preset, given_env_kwargs, given_settings, named_algorithm, names
 from thorndike.errors import UserError
+from thorndike.learning_sources import check_source
 from thorndike.plotting.style import check_plot_file
 from thorndike.settings import read_config_fields
 from thorndike.training.sweep_directory import find_sweep, read_sweep
@@ -79,6 +80,7 @@ def _swept(options: Namespace, words: Sequence[str]) -> "Sweep":
     over = over_texts(options.over)
     swept = swept_settings(over, read_config_fields(algorithm), algorithm, settings)
     check_search(chosen_search(swept, options.search, options.trials))
+    check_source(algorithm, environment)
     check_environment(
         environment,
         engine=options.engine,

@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING
 from thorndike.algorithms import ALGORITHMS
 from thorndike.cli.answer import Answer
 from thorndike.cli.environment_names import check_environment
-from thorndike.cli.find_run import add_output_argument, exists
+from thorndike.cli.find_run import add_output_argument, exists, find_run
 from thorndike.cli.parser import Parser, positive_whole, seed_number
 from thorndike.environments.wrapper_names import parse_wrapper
 from thorndike.errors import UserError
+from thorndike.learning_sources import check_source, is_dataset
 from thorndike.settings import FieldFacts, parse_settings, read_config_fields
 from thorndike.suggestions import did_you_mean
 
@@ -33,6 +34,7 @@ EXAMPLES = """\
   thorndike train q_learning FrozenLake-v1 --env-set is_slippery=False
   thorndike train ppo my_module:MyEnv-v0 --seeds 4 --json
   thorndike train ppo DeepSea-v0 --wrap random_network_distillation
+  thorndike train iql datasets/CartPole-v1/ppo-v0 --steps 20k
 
 every setting of an algorithm (`thorndike list settings ppo`) may also stand as a flag: --learning-rate 1e-3"""
 
@@ -46,14 +48,17 @@ def run(words: Sequence[str]) -> Answer:
     settings, env_kwargs = given_settings(options, algorithm), given_env_kwargs(options.env_set)
     # Before the environment, for which JAX is imported if it has a table.
     check_output(options.output)
-    check_environment(
-        environment,
-        engine=options.engine,
-        env_kwargs=env_kwargs,
-        max_episode_steps=options.max_episode_steps,
-        algorithm=algorithm,
-    )
-    check_preset(algorithm, environment, options.preset)
+    check_source(algorithm, environment)
+    if not is_dataset(environment):
+        check_environment(
+            environment,
+            engine=options.engine,
+            env_kwargs=env_kwargs,
+            max_episode_steps=options.max_episode_steps,
+            algorithm=algorithm,
+        )
+        check_preset(algorithm, environment, options.preset)
+    start_from = None if options.start_from is None else find_run(options.start_from, options.output)
     wrapper_settings = [parse_wrapper(text) for text in options.wrap]
     from thorndike.api import train
     from thorndike.environments.wrappers import build_wrapper
@@ -79,6 +84,7 @@ def run(words: Sequence[str]) -> Answer:
         actor_schedule=options.actor_schedule,
         env_restarts=options.env_restarts,
         wrappers=[build_wrapper(each) for each in wrapper_settings] or None,
+        start_from=start_from,
         progress=not options.json,
         command=shlex.join(["thorndike", "train", *words]),
     )
@@ -88,7 +94,9 @@ def run(words: Sequence[str]) -> Answer:
 def add_training_arguments(parser: Parser, fields: Mapping[str, FieldFacts]) -> None:
     """The arguments that say what is trained; `train` and `bench` share them."""
     parser.add_argument("algorithm", nargs="?", metavar="ALGORITHM", help=f"one of {', '.join(ALGORITHMS)}")
-    parser.add_argument("environment", nargs="?", metavar="ENVIRONMENT", help="a Gymnasium id, module:Id, or path/to/file.py:ClassName")
+    parser.add_argument(
+        "environment", nargs="?", metavar="ENVIRONMENT", help="a Gymnasium id, module:Id, path/to/file.py:ClassName, or a dataset's folder"
+    )
     _add_old_hands_flags(parser)
     parser.add_argument("--steps", type=positive_whole, help="environment steps of each seed: 50000, 50k, 1e6")
     parser.add_argument("--seeds", type=positive_whole, default=1, help="independent agents trained at once (default: 1)")
@@ -231,6 +239,7 @@ def _parse(words: Sequence[str]) -> Namespace:
         metavar="WRAPPER",
         help="a wrapper in place of the preset's, as in 'count_bonus(coefficient=0.1)'; may be repeated, the first nearest the environment",
     )
+    parser.add_argument("--start-from", metavar="RUN", help="a run of the same algorithm on a dataset, to go on from online (awac)")
     parser.add_argument("--name", help="the last part of the run directory's name")
     parser.add_argument("--checkpoint-every", type=positive_whole, metavar="STEPS", help="steps between two checkpoints")
     parser.add_argument(

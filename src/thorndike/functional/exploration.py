@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree
@@ -122,6 +123,15 @@ def _lower_triangle(shape: tuple[int, ...]) -> Bool[Array, "*batch n n"]:
     """For rows ``[..., n]``: whether the last index is at most the one before it."""
     square = (*shape, shape[-1])
     return lax.broadcasted_iota(jnp.int32, square, len(shape)) <= lax.broadcasted_iota(jnp.int32, square, len(shape) - 1)
+
+
+def epsilon_greedy_probabilities(
+    q: Float[Array, "*batch actions"], epsilon: Float[Array, ""], allowed: Bool[Array, "*batch actions"] | None = None
+) -> Float[Array, "*batch actions"]:
+    """What ``epsilon_greedy`` without random ties chooses each action with."""
+    first = jax.nn.one_hot(q.argmax(axis=-1), q.shape[-1])
+    at_random = jnp.ones(q.shape, q.dtype) if allowed is None else (allowed | (q >= q.max(axis=-1, keepdims=True))).astype(q.dtype)
+    return epsilon * at_random / at_random.sum(axis=-1, keepdims=True) + (1.0 - epsilon) * first
 
 
 def _running_count(mask: Bool[Array, "*batch n"]) -> Int[Array, "*batch n"]:

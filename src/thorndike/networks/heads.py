@@ -7,14 +7,14 @@ import flax.linen as nn
 import gymnasium
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from thorndike.errors import UserError
 from thorndike.functional.action_distributions import ActionDistribution, action_distribution
 from thorndike.functional.held_noise import noise_features, state_dependent_parameters, with_constant
 from thorndike.networks.dense import dense
 from thorndike.networks.masking import masked
-from thorndike.networks.network import Network, NetworkBuilder
+from thorndike.networks.network import Network, NetworkBuilder, apply_step
 from thorndike.networks.recurrent import Remembering, remembering, side_by_side
 from thorndike.networks.torso import MLP, Torso, is_image, torch_uniform
 from thorndike.types import EnvSpec, Number, Observation
@@ -255,3 +255,10 @@ def _remembering(spec: EnvSpec, shape: Shape, kernel_init: Callable[..., Array],
 
 def _pair(module: nn.Module) -> Network:
     return Network(init=lambda key, obs: module.init(key, obs)["params"], apply=lambda params, obs: module.apply({"params": params}, obs))
+
+
+def softmax_probabilities(network: Network, space: gymnasium.Space) -> Callable[[PyTree, PyTree, Observation], Float[Array, "*B n"]] | None:
+    """Parameters, memory, obs -> the probability of each Discrete action, of a network that gives logits and a value; None for others."""
+    if not isinstance(space, gymnasium.spaces.Discrete):
+        return None
+    return lambda params, memory, obs: nn.softmax(apply_step(network, params, memory, obs)[1][0])

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int, Key, PyTree
 
 from thorndike.errors import UserError
 from thorndike.functional.distributional import ReturnDistribution, expected_value
-from thorndike.functional.exploration import boltzmann, epsilon_greedy
+from thorndike.functional.exploration import boltzmann, epsilon_greedy, epsilon_greedy_probabilities
 from thorndike.functional.schedules import Rate, schedule
 from thorndike.functional.value_loss import Munchausen, Rule
 from thorndike.networks.heads import Shape
@@ -193,6 +193,11 @@ def deep_q(name: str, config: Settings, options: Options, spec: EnvSpec, network
             choice = boltzmann(q, actor.epsilon[None], noise.choice)
         return later, choice.action, {"memory": memory}
 
+    def probabilities(actor: Actor, memory: PyTree, obs: Observation) -> Float[Array, "B A"]:
+        _, outputs = apply_step(net.network, net.means(actor.params), memory, obs)
+        mask = allowed(obs) if has_mask(spec.observation_space) else None
+        return epsilon_greedy_probabilities(net.q(outputs, obs), actor.epsilon, mask)
+
     def greedy(actor: Actor, memory: PyTree, obs: Observation, noise: PyTree) -> tuple[PyTree, Int[Array, " B"], PyTree]:
         memory, outputs = apply_step(net.network, net.means(actor.params), memory, obs)
         return memory, jnp.argmax(net.q(outputs, obs), axis=-1).astype(jnp.int32), {}
@@ -225,6 +230,8 @@ def deep_q(name: str, config: Settings, options: Options, spec: EnvSpec, network
         update=update,
         observe=observe,
         needs=Needs(rollout_length=plan.rollout_length, on_policy=False, warmup_iterations=plan.warmup_iterations),
+        # Noisy layers act by a draw of their weights: nobody can say how often which action comes first.
+        probabilities=probabilities if not net.noise_size and options.temperature is None else None,
     )
 
 

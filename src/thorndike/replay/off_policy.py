@@ -61,20 +61,25 @@ class Settings(Protocol):
         """Of the exploration noise over time: 0 white, 1 pink, 2 red."""
 
     @property
-    def goal_selection_strategy(self) -> str:
-        """Where replay finds other goals: see ``hindsight.py``."""
-
-    @property
-    def n_sampled_goal(self) -> int:
-        """Transitions with another goal for each one with its own."""
-
-    @property
     def net_arch(self) -> tuple[int, ...]:
         """Widths of the hidden layers."""
 
     @property
     def activation(self) -> str:
         """After each hidden layer."""
+
+
+@runtime_checkable
+class Relabelling(Protocol):
+    """The settings of those whose replay can tell what would have been right for another goal."""
+
+    @property
+    def goal_selection_strategy(self) -> str:
+        """Where replay finds other goals: see ``hindsight.py``."""
+
+    @property
+    def n_sampled_goal(self) -> int:
+        """Transitions with another goal for each one with its own."""
 
 
 class Method(NamedTuple):
@@ -141,7 +146,9 @@ def off_policy(method: Method, config: Settings, spec: EnvSpec) -> Algorithm:
     per_iteration = plan.rollout_length * spec.num_envs
     learning_rate = schedule(config.learning_rate)
     ring = Ring(row_shapes(spec), plan.ring_steps, spec.num_envs)
-    hindsight = Hindsight(config.goal_selection_strategy, config.n_sampled_goal)
+    hindsight = Hindsight("none", 0)
+    if isinstance(config, Relabelling):
+        hindsight = Hindsight(config.goal_selection_strategy, config.n_sampled_goal)
     noise_shape = (spec.num_envs, *((method.features,) if method.features else ()), method.dimensions)
     memory = replay_for(ring, config.batch_size, config.gamma, hindsight, spec)
 

@@ -66,6 +66,14 @@ def _numbers_of(space: gymnasium.Space) -> int:
     return sum(np.size(leaf) for leaf in jax.tree.leaves(space.sample()))
 
 
+def from_environment(space: gymnasium.Space, action: Action) -> Action:
+    """The learner's action for one in the environment's units: the inverse of ``to_environment`` within the bounds."""
+    if not isinstance(space, gymnasium.spaces.Box) or not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
+        return action
+    low, high = (bound.astype(np.float32) for bound in (space.low, space.high))
+    return 2.0 * (action - low) / (high - low) - 1.0
+
+
 def by_iteration(noise: Noise, iterations: int) -> Noise:
     """Noise ``[iterations * T, ...]`` as ``[iterations, T, ...]``."""
     return jax.tree.map(lambda x: x.reshape((iterations, -1, *x.shape[1:])), noise)
