@@ -120,6 +120,35 @@ TASKS = (
         (thorndike("Thorndike", "gymnasium"), peer("Stable-Baselines3", "sb3_ppo_gymnasium.py")),
         (Claim("Thorndike", "Stable-Baselines3", 3),),
     ),
+    *(
+        Task(
+            name,
+            f"{name.upper()} on HalfCheetah-v5, equal settings",
+            "rate",
+            "one environment, one update of every network an environment step, 256x256, batch 256, replay of 100,000",
+            (
+                thorndike("Thorndike", name),
+                peer("SBX", "sbx_continuous.py", name),
+                peer("Stable-Baselines3", "sb3_continuous.py", name),
+            ),
+            (Claim("Thorndike", "Stable-Baselines3", 3.5), Claim("Thorndike", "SBX", 1.6)),
+        )
+        for name in ("sac", "td3")
+    ),
+    *(
+        Task(
+            f"minatar_{name}",
+            f"{name.upper()} on MinAtar Breakout, equal settings",
+            "rate",
+            settings + ", a perceptron of 64x64 on the flattened board",
+            (thorndike("Thorndike", f"minatar_{name}"), peer("rejax", f"rejax_{name}.py", "--environment", "Breakout-MinAtar")),
+            (Claim("Thorndike", "rejax", 1.5),),
+        )
+        for name, settings in (
+            ("ppo", "64 environments x 128 steps, 4 epochs of 4 minibatches of 2,048, the rest as in PPO on CartPole-v1"),
+            ("dqn", "10 environments, batch 128, one update each 10 environment steps, the rest as in DQN on CartPole-v1"),
+        )
+    ),
     Task(
         "threshold",
         "CartPole-v1 from process start to a mean return of 475",

@@ -25,6 +25,8 @@ class Job(NamedTuple):
     num_envs: int | None
     settings: Mapping[str, object]
     engine: str = "auto"
+    flat: bool = False
+    """Whether images go through a plain multilayer perceptron, as the peer's do."""
 
 
 PPO: dict[str, object] = {
@@ -53,13 +55,48 @@ DQN = {
     "exploration_fraction": 0.5,
     "exploration_final_eps": 0.05,
 }
+CONTINUOUS = {
+    "learning_rate": 3e-4,
+    "buffer_size": 100_000,
+    "learning_starts": 100,
+    "batch_size": 256,
+    "tau": 0.005,
+    "gamma": 0.99,
+    "train_freq": 1,
+    "gradient_steps": 1,
+    "net_arch": (256, 256),
+}
 Q_LEARNING = {"learning_rate": 0.1, "gamma": 0.99, "exploration_fraction": 0.5, "exploration_final_eps": 0.1}
 JOBS = {
     "ppo": Job("ppo", "CartPole-v1", 1_024_000, 4, PPO),
     "dqn": Job("dqn", "CartPole-v1", 300_000, 10, DQN),
     "q_learning": Job("q_learning", "FrozenLake-v1", 2_000_000, 1, Q_LEARNING),
+    "sac": Job("sac", "HalfCheetah-v5", 8_000, 1, CONTINUOUS),
+    "td3": Job("td3", "HalfCheetah-v5", 8_000, 1, CONTINUOUS),
+    "minatar_ppo": Job("ppo", "MinAtar/Breakout-v1", 409_600, 64, {**PPO, "batch_size": 2_048}, flat=True),
+    "minatar_dqn": Job("dqn", "MinAtar/Breakout-v1", 200_000, 10, {**DQN, "net_arch": (64, 64)}, flat=True),
     "gymnasium": Job("ppo", "CartPole-v1", 102_400, 8, {**PPO, "batch_size": 256}, engine="gymnasium"),
 }
+
+
+def perceptron(job: Job):
+    """The builder of a network that sees an image as one row of numbers; hidden layers as the job's own would be."""
+    import gymnasium
+
+    from thorndike.networks.heads import actor_critic, q_values
+    from thorndike.networks.network import Network
+
+    def build(spec, outputs: int) -> Network:
+        row = gymnasium.spaces.Box(0, 1, (spec.observation_space.shape[0] ** 2 * spec.observation_space.shape[-1],))
+        hidden = job.settings["net_arch"]
+        net = actor_critic(row, outputs, 0, hidden, "tanh") if job.algorithm == "ppo" else q_values(row, outputs, hidden, "relu")
+
+        def flat(obs):
+            return obs.reshape((obs.shape[0], -1)).astype("float32")
+
+        return Network(lambda key, obs: net.init(key, flat(obs)), lambda params, obs: net.apply(params, flat(obs)))
+
+    return build
 
 
 def log_points(run: Path) -> list[dict]:
@@ -103,6 +140,7 @@ def main() -> None:
             settings=job.settings,
             preset="none",
             engine=job.engine,
+            network=perceptron(job) if job.flat else None,
             device="cpu",
             output=folder,
         )

@@ -1,6 +1,7 @@
-"""rejax DQN on gymnax's CartPole-v1, the settings of task ``dqn``. Compilation and the warm-up without learning are ahead of the window.
+"""rejax DQN on gymnax's CartPole-v1 or Breakout-MinAtar, the settings of tasks ``dqn`` and ``minatar_dqn``.
 
-rejax 0.1.3 always builds 64x64 Q-networks, so the 120-84 network of the task is put in its place.
+Compilation and the warm-up without learning are ahead of the window.
+rejax 0.1.3 always builds 64x64 Q-networks, so the 120-84 network of task ``dqn`` is put in its place.
 """
 
 import argparse
@@ -12,15 +13,18 @@ from measurement import cpu_seconds, now, report, window
 from rejax.networks import DiscreteQNetwork, EpsilonGreedyPolicy
 
 NUM_ENVS = 10
+NETWORKS = {"CartPole-v1": ((120, 84), 2), "Breakout-MinAtar": ((64, 64), 3)}
+"""Environment -> widths of the hidden layers, number of actions."""
 
 
-def make_chunk(steps: int):
+def make_chunk(environment: str, steps: int):
     """A jitted function: training state -> training state after ``steps`` environment steps, and the initial state."""
-    network = EpsilonGreedyPolicy(DiscreteQNetwork)(hidden_layer_sizes=(120, 84), action_dim=2, activation=nn.relu)
+    hidden, actions = NETWORKS[environment]
+    network = EpsilonGreedyPolicy(DiscreteQNetwork)(hidden_layer_sizes=hidden, action_dim=actions, activation=nn.relu)
     dqn = (
         rejax.get_algo("dqn")
         .create(
-            env="CartPole-v1",
+            env=environment,
             num_envs=NUM_ENVS,
             buffer_size=10_000,
             fill_buffer=1_000,
@@ -49,9 +53,10 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--steps", type=int, default=100_000)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--environment", choices=NETWORKS, default="CartPole-v1")
     options = parser.parse_args()
     import_cpu_s = cpu_seconds()
-    chunk, init = make_chunk(options.steps)
+    chunk, init = make_chunk(options.environment, options.steps)
     before = now()
     state = jax.block_until_ready(init(jax.random.PRNGKey(options.seed)))
     compiled = chunk.lower(state).compile()

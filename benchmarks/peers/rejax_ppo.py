@@ -1,4 +1,4 @@
-"""rejax PPO on gymnax's CartPole-v1, the settings of task ``ppo``. Compilation is one call ahead of the window.
+"""rejax PPO on gymnax's CartPole-v1 or Breakout-MinAtar, the settings of tasks ``ppo`` and ``minatar_ppo``. Compilation is one call ahead.
 
 ``agent_kwargs`` reaches the networks here; the chunk is one jitted ``train`` call without rejax's evaluation of 128 episodes.
 """
@@ -9,16 +9,16 @@ import jax
 import rejax
 from measurement import cpu_seconds, now, report, window
 
-ITERATION = 4 * 128
+NUM_ENVS = {"CartPole-v1": 4, "Breakout-MinAtar": 64}
 
 
-def make_chunk(steps: int):
+def make_chunk(environment: str, steps: int):
     """A jitted function: training state -> training state after ``steps`` environment steps, and the initial state."""
     ppo = (
         rejax.get_algo("ppo")
         .create(
-            env="CartPole-v1",
-            num_envs=4,
+            env=environment,
+            num_envs=NUM_ENVS[environment],
             num_steps=128,
             num_epochs=4,
             num_minibatches=4,
@@ -46,10 +46,12 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--steps", type=int, default=500_000)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--environment", choices=NUM_ENVS, default="CartPole-v1")
     options = parser.parse_args()
     import_cpu_s = cpu_seconds()
-    steps = max(options.steps // ITERATION, 1) * ITERATION
-    chunk, init = make_chunk(steps)
+    iteration = NUM_ENVS[options.environment] * 128
+    steps = max(options.steps // iteration, 1) * iteration
+    chunk, init = make_chunk(options.environment, steps)
     before = now()
     state = jax.block_until_ready(init(jax.random.PRNGKey(options.seed)))
     compiled = chunk.lower(state).compile()

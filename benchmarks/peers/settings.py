@@ -25,6 +25,16 @@ DQN = {
     "exploration_fraction": 0.5,
     "exploration_final_eps": 0.05,
 }
+CONTINUOUS = {
+    "learning_rate": 3e-4,
+    "buffer_size": 100_000,
+    "learning_starts": 100,
+    "batch_size": 256,
+    "tau": 0.005,
+    "gamma": 0.99,
+    "train_freq": 1,
+    "gradient_steps": 1,
+}
 # RL Baselines3 Zoo, hyperparams/ppo.yml, CartPole-v1: 100,000 steps, both rates falling linearly to 0.
 PPO_ZOO = {"n_steps": 32, "batch_size": 256, "gae_lambda": 0.8, "gamma": 0.98, "n_epochs": 20, "ent_coef": 0.0}
 PPO_ZOO_ENVS = 8

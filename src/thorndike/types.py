@@ -18,7 +18,14 @@ Action: TypeAlias = PyTree
 """``int32[B]`` (Discrete), ``int32[B, K]`` (MultiDiscrete, MultiBinary) or ``float32[B, D]`` (Box)."""
 
 Noise: TypeAlias = PyTree
-"""Random numbers drawn ahead of a scan; its leading axis is time. By default one PRNG key a step."""
+"""Random numbers drawn ahead of a scan, ``[T, B, ...]``, or ``Shared`` ones ``[T, ...]``."""
+
+
+class Shared(NamedTuple):
+    """Noise of a step that all environments see, where other noise has a row for each of them."""
+
+    numbers: Array
+
 
 Metrics: TypeAlias = dict[str, Array]
 """Scalars by Stable-Baselines3's metric names, for example ``train/approx_kl``."""

@@ -32,8 +32,10 @@ from thorndike.algorithms import (
 from thorndike.environments import wrappers
 from thorndike.environments.native import factory
 from thorndike.environments.native.vectorize import vectorize
+from thorndike.networks.torso import example_observation
 from thorndike.training import runner as runner_module
 from thorndike.training.checkpoints import Progressed, restore, save_checkpoint
+from thorndike.training.policy import Policy
 from thorndike.training.run_directory import checkpoints
 from thorndike.training.runner import Carry, Runner, runner
 from thorndike.training.sources import compiled_source
@@ -130,6 +132,22 @@ ALL = RUN | {
 
 def described(tree) -> tuple:
     return jax.tree.structure(tree), [(leaf.shape, leaf.dtype, leaf.weak_type) for leaf in jax.tree.leaves(tree)]
+
+
+@pytest.mark.parametrize("case", ALL.values(), ids=ALL)
+def test_a_policy_acts_in_another_number_of_environments_than_it_learnt_in(case):
+    algorithm, source = case.make()
+    size = 2 * NUM_ENVS + 1
+
+    def decide(key):
+        policy = Policy(algorithm, wrappers.chain(*case.wrappers), source.spec, actors=(), statistics=(), best=0)
+        obs = jax.tree.map(lambda x: jnp.broadcast_to(x, (size, *x.shape[1:])), example_observation(source.spec.observation_space))
+        actor, memory, noise = algorithm.actor(algorithm.init(key)), algorithm.memory(size), policy.noise(key, size)
+        return algorithm.act(actor, memory, obs, noise)[:2], algorithm.greedy(actor, memory, obs, noise)[:2]
+
+    (memory, action), (later, greedy) = jax.eval_shape(decide, jax.random.key(0))
+    assert {action.shape[0], greedy.shape[0]} == {size}
+    assert jax.tree.map(jnp.shape, memory) == jax.tree.map(jnp.shape, later) == jax.tree.map(jnp.shape, algorithm.memory(size))
 
 
 @pytest.mark.parametrize("case", ALL.values(), ids=ALL)

@@ -8,7 +8,7 @@ from scipy import stats
 
 from thorndike.functional.shuffling import minibatches, permutations
 
-SIZES = (1, 2, 3, 64, 100, 4096, 5000)
+SIZES = (1, 2, 3, 64, 100, 4096, 5000, 70_000)
 
 
 @pytest.mark.parametrize("n", SIZES)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias, cast
 
 import gymnasium
 
+from thorndike import startup
 from thorndike.algorithms import ALGORITHMS
 from thorndike.environments import registry, wrappers
 from thorndike.environments.native.vectorize import Dynamics
@@ -18,6 +19,7 @@ from thorndike.networks.network import NetworkBuilder
 from thorndike.networks.torso import is_image
 from thorndike.suggestions import did_you_mean
 from thorndike.training.actor_threads import SCHEDULES, ActorThreads, threaded_source
+from thorndike.training.devices import devices_for
 from thorndike.training.host_source import HostEngine, HostSource, host_source
 from thorndike.training.json_files import TEXT, Kind, check_fields, whole
 from thorndike.training.presets import Preset
@@ -204,8 +206,12 @@ def build_job(
     network: NetworkBuilder | None,
     env_timeout: float | None = None,
     lanes: Lanes | None = None,
+    devices: int = 1,
 ) -> Job:
-    """Bind a request to its environment, learner, source and runner; ``lanes`` are other agents than its seeds, with their own learner."""
+    """Bind a request to its environment, learner, source and runner; ``lanes`` are other agents than its seeds, with their own learner.
+
+    On compiled environments at most ``devices`` share the agents.
+    """
     wrapper = wrappers.from_settings(request.wrappers) if given is None else wrappers.chain(*given)
     indices = range(request.seeds) if lanes is None else lanes.agents
     build = partial(build_algorithm, request.algorithm, request.config, network=network) if lanes is None else lanes.build
@@ -223,7 +229,7 @@ def build_job(
             env_timeout=env_timeout,
         )
         spec, source, algorithm, plan, close = _on_host(request, engine, wrapper, build, indices)
-    bound = runner(algorithm, source, request.seed, indices)
+    bound = runner(algorithm, source, request.seed, indices, devices_for(len(indices), devices))
     return Job(request, algorithm, wrapper, spec, source, bound, plan, close)
 
 
@@ -251,6 +257,12 @@ def _on_host(
         raise
     threaded = threaded_source(engines, make, algorithm, wrapper, request.seed, indices, plan.checkpoint_every, actors)
     return spec, threaded.source, algorithm, plan, threaded.close
+
+
+def prepare_devices(choice: registry.Choice, seeds: int, at_most: int | None = None) -> None:
+    """Before JAX chooses its devices: as many cores as can share the seeds count as devices, where the environment is compiled."""
+    if choice.engine == "native":
+        startup.count_cores_as_devices(devices_for(seeds, min(startup.cores(), at_most or seeds)))
 
 
 def is_large(request_algorithm: str, choice: registry.Choice) -> bool:

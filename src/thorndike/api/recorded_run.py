@@ -9,6 +9,7 @@ from thorndike.api.building import EnvironmentLike, Job, Request, build_job
 from thorndike.environments import registry
 from thorndike.errors import UserError
 from thorndike.networks.network import NetworkBuilder
+from thorndike.training.devices import devices_for
 from thorndike.training.json_files import Json, blamed_on
 from thorndike.training.machine import differences
 from thorndike.training.notices import notice
@@ -46,6 +47,8 @@ def rebuild(record: Json, request: Request, run: Path, objects: Objects, env_tim
     One notice says what differs here. Raises ``UserError``.
     """
     processors = str(record["processors"])
+    if request.engine == "native":
+        startup.count_cores_as_devices(devices_for(request.seeds, startup.cores()))
     device = startup.choose_device(str(record["device"]), False, int(processors) if processors.isascii() and processors.isdigit() else None)
     found = differences(record, {**facts(), "device": device})
     if found:
@@ -57,7 +60,7 @@ def rebuild(record: Json, request: Request, run: Path, objects: Objects, env_tim
             env_kwargs=request.env_kwargs,
             max_episode_steps=request.max_episode_steps,
         )
-        return build_job(request, choice, objects.wrappers, objects.network, env_timeout)
+        return build_job(request, choice, objects.wrappers, objects.network, env_timeout, devices=startup.device_count(None))
 
 
 def refuse_code(run: Path, environment: str) -> None:

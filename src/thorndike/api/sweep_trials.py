@@ -10,6 +10,7 @@ from typing import NamedTuple, TypeAlias
 import jax
 import jax.numpy as jnp
 
+from thorndike import startup
 from thorndike.api.building import Job, Lanes, Request, build_config, build_from_config, build_job
 from thorndike.api.loading import bounded, reference_engines
 from thorndike.environments import registry, wrappers
@@ -145,7 +146,9 @@ class TrialRunner:
                 return varied(build, group.forms, build({}), first)
 
             request = self._request._replace(config=group.config, seeds=batch.size * seeds)
-            self._jobs[key] = build_job(request, self._choice, None, None, lanes=Lanes(self._agents(batch), learner))
+            self._jobs[key] = build_job(
+                request, self._choice, None, None, lanes=Lanes(self._agents(batch), learner), devices=startup.device_count(None)
+            )
         return self._jobs[key]
 
     def _agents(self, batch: Batch) -> tuple[int, ...]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from thorndike import startup
 from thorndike.algorithms import ALGORITHMS
-from thorndike.api.building import Request, check_algorithm, full_config, full_request, is_large
+from thorndike.api.building import Request, check_algorithm, full_config, full_request, is_large, prepare_devices
 from thorndike.api.loading import load
 from thorndike.api.recorded_run import refuse_code
 from thorndike.api.sweep_trials import Numbered, TrialRunner, batches, check_trials, group_trials, trials_at_once
@@ -144,6 +144,7 @@ def sweep(
         algorithm, choice, find_preset(algorithm, choice.id, preset), None, settings or {}, steps, num_envs, seeds, seed, None
     )
     request = request._replace(log_every=math.ceil(request.steps / LOG_POINTS))
+    prepare_devices(choice, seeds)
     backend = startup.choose_device(device, is_large(algorithm, choice))
     if found.kind != "optuna":
         check_trials(request, _learner_spec(request, choice), list(enumerate(listed_trials(swept, found, seed))))

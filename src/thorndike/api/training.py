@@ -7,7 +7,7 @@ from contextlib import closing
 from pathlib import Path
 
 from thorndike import startup
-from thorndike.api.building import EnvironmentLike, Job, Request, build_job, check_algorithm, full_request, is_large
+from thorndike.api.building import EnvironmentLike, Job, Request, build_job, check_algorithm, full_request, is_large, prepare_devices
 from thorndike.api.exporting import export_policy
 from thorndike.api.planning import plan_run
 from thorndike.api.recorded_run import Objects, rebuild, request_in
@@ -43,6 +43,7 @@ def train(
     preset: str | None = None,
     engine: str = "auto",
     device: str = "auto",
+    devices: int | None = None,
     output: str | Path = "runs",
     name: str | None = None,
     checkpoint_every: int | None = None,
@@ -61,10 +62,11 @@ def train(
 
     ``steps`` are environment steps of each seed. What is not given comes from the environment's preset, then from the algorithm's
     defaults; ``preset="none"`` ignores presets. ``wrappers`` are those of ``thorndike.environments.wrappers``; ``network`` builds a
-    network of your own. ``env_timeout`` is how many seconds a step of an environment in a process of its own may take (60 by default), a
-    reset twice that. ``actor_threads`` play host environments while the learner learns, each a pool of ``num_envs`` of its own, on the
-    ``fixed`` schedule, which can be repeated, or the ``free`` one; ``env_restarts`` is how often a pool may be made anew after a fault.
-    Raises ``UserError`` for anything that cannot be.
+    network of your own. On compiled environments the seeds share the ``devices`` there are (cores, on a CPU), as far as their number
+    divides; that changes how long it takes and no result. ``env_timeout`` is how many seconds a step of an environment in a process of
+    its own may take (60 by default), a reset twice that. ``actor_threads`` play host environments while the learner learns, each a pool
+    of ``num_envs`` of its own, on the ``fixed`` schedule, which can be repeated, or the ``free`` one; ``env_restarts`` is how often a
+    pool may be made anew after a fault. Raises ``UserError`` for anything that cannot be.
     """
     check_algorithm(algorithm)
     if not 0 <= seed < 2**32 or seeds < 1:
@@ -75,8 +77,9 @@ def train(
     found = find_preset(algorithm, choice.id, preset)
     actors = ActorThreads(actor_threads, actor_schedule, env_restarts)
     request = full_request(algorithm, choice, found, wrappers, settings or {}, steps, num_envs, seeds, seed, checkpoint_every, actors)
+    prepare_devices(choice, seeds, devices)
     backend = startup.choose_device(device, is_large(algorithm, choice))
-    job = build_job(request, choice, wrappers, network, env_timeout)
+    job = build_job(request, choice, wrappers, network, env_timeout, devices=startup.device_count(devices))
     run = new_run_directory(output, choice.id, algorithm, name)
     objects = {"network": "user" if network else "default", "environment_object": not isinstance(environment, str)}
     record = {**facts(), "status": "running", "command": command, "device": backend, **objects, **as_json(request)}

@@ -56,6 +56,7 @@ def run(words: Sequence[str]) -> Answer:
                 max_episode_steps=options.max_episode_steps,
                 engine=options.engine,
                 device=options.device,
+                devices=options.devices,
                 output=folder,
                 env_kwargs=env_kwargs,
             )

@@ -65,6 +65,7 @@ def run(words: Sequence[str]) -> Answer:
         preset=options.preset,
         engine=options.engine,
         device=options.device,
+        devices=options.devices,
         output=options.output,
         name=options.name,
         checkpoint_every=options.checkpoint_every,
@@ -100,6 +101,9 @@ def add_training_arguments(parser: Parser, fields: Mapping[str, FieldFacts]) -> 
     )
     parser.add_argument("--engine", choices=ENGINES, default="auto", help="what steps the environment (default: the fastest that can)")
     parser.add_argument("--device", choices=DEVICES, default="auto", help="where learning is computed (default: chosen by size)")
+    parser.add_argument(
+        "--devices", type=positive_whole, metavar="N", help="how many devices (a CPU's cores) share the seeds at most (default: all)"
+    )
     taken = set(parser._option_string_actions)
     for name in fields:
         flag = "--" + name.replace("_", "-")

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from thorndike.functional.action_distributions import ActionDistribution
+from thorndike.networks.dense import dense
 from thorndike.networks.masking import masked
 from thorndike.networks.network import Network, NetworkBuilder
 from thorndike.networks.recurrent import Remembering, remembering, side_by_side
@@ -36,8 +37,8 @@ class ActorCritic(nn.Module):
             value_features = features
         else:
             value_features = Torso(self.space, self.hidden, self.activation, hidden_init, name="value_torso")(obs)
-        parameters = nn.Dense(self.outputs, kernel_init=nn.initializers.orthogonal(0.01), name="policy")(features)
-        value = nn.Dense(1, kernel_init=nn.initializers.orthogonal(1.0), name="value")(value_features)
+        parameters = dense(self.outputs, nn.initializers.orthogonal(0.01), name="policy")(features)
+        value = dense(1, nn.initializers.orthogonal(1.0), name="value")(value_features)
         if self.free_parameters:
             log_std = self.param("log_std", nn.initializers.constant(self.log_std_init), (self.free_parameters,))
             spread = jnp.broadcast_to(log_std, (*parameters.shape[:-1], self.free_parameters))
@@ -55,7 +56,7 @@ class PolicyHead(nn.Module):
     @nn.compact
     def __call__(self, features: Float[Array, "B F"]) -> Float[Array, "B P"]:
         """Features to policy parameters."""
-        parameters = nn.Dense(self.outputs, kernel_init=nn.initializers.orthogonal(0.01), name="policy")(features)
+        parameters = dense(self.outputs, nn.initializers.orthogonal(0.01), name="policy")(features)
         if not self.free_parameters:
             return parameters
         log_std = self.param("log_std", nn.initializers.constant(self.log_std_init), (self.free_parameters,))
@@ -68,7 +69,7 @@ class ValueHead(nn.Module):
     @nn.compact
     def __call__(self, features: Float[Array, "B F"]) -> Float[Array, " B"]:
         """Features to a value."""
-        return nn.Dense(1, kernel_init=nn.initializers.orthogonal(1.0), name="value")(features)[..., 0]
+        return dense(1, nn.initializers.orthogonal(1.0), name="value")(features)[..., 0]
 
 
 class PolicyAndValue(nn.Module):
@@ -94,10 +95,10 @@ class QHead(nn.Module):
     @nn.compact
     def __call__(self, features: Float[Array, "B F"]) -> Float[Array, "B A"]:
         """Features to one value an action."""
-        advantage = nn.Dense(self.actions * self.outputs, kernel_init=torch_uniform, name="q")(features)
+        advantage = dense(self.actions * self.outputs, torch_uniform, name="q")(features)
         if not self.dueling:
             return advantage
-        return combined(nn.Dense(self.outputs, kernel_init=torch_uniform, name="value")(features), advantage)
+        return combined(dense(self.outputs, torch_uniform, name="value")(features), advantage)
 
 
 class QValues(nn.Module):
@@ -120,7 +121,7 @@ class QValues(nn.Module):
         shared = self.hidden[:-1] if self.dueling else self.hidden
         features = Torso(self.space, shared, self.activation, torch_uniform, self.layer_norm, name="torso")(obs)
         if not self.dueling:
-            return nn.Dense(self.actions * self.outputs, kernel_init=torch_uniform, name="q")(features)
+            return dense(self.actions * self.outputs, torch_uniform, name="q")(features)
         return combined(self._stream(features, 1, "value"), self._stream(features, self.actions, "advantage"))
 
     def _stream(self, features: Float[Array, "B F"], rows: int, name: str) -> Float[Array, "B G"]:

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from thorndike.errors import UserError
+from thorndike.networks.dense import dense
 from thorndike.networks.masking import observed, without_mask
 from thorndike.types import Observation
 
@@ -37,11 +38,11 @@ class MLP(nn.Module):
     def __call__(self, x: Float[Array, "*B F"]) -> Float[Array, "*B G"]:
         """Features to features, or to ``outputs`` numbers."""
         for width in self.hidden:
-            x = nn.Dense(width, kernel_init=self.kernel_init)(x)
+            x = dense(width, self.kernel_init)(x)
             x = ACTIVATIONS[self.activation](nn.LayerNorm()(x) if self.layer_norm else x)
         if self.outputs is None:
             return x
-        return nn.Dense(self.outputs, kernel_init=self.output_init or self.kernel_init)(x)
+        return dense(self.outputs, self.output_init or self.kernel_init)(x)
 
 
 class SmallConvolution(nn.Module):
@@ -90,7 +91,7 @@ class CNN(nn.Module):
                 x = self._activated(convolution(x))
         x = x.reshape((x.shape[0], -1))
         for width in self.hidden:
-            x = self._activated(nn.Dense(width, kernel_init=self.kernel_init)(x))
+            x = self._activated(dense(width, self.kernel_init)(x))
         return x
 
     def _activated(self, x: Float[Array, "*B F"]) -> Float[Array, "*B F"]:

@@ -25,7 +25,7 @@ from thorndike.replay.pace import Pace, pace
 from thorndike.replay.replay import Replay, Ring, prioritized_replay, sequence_replay, uniform_replay
 from thorndike.replay.uniform import row_shapes
 from thorndike.replay.value_learning import Parts, State, begin, begin_anew, learn, move_target
-from thorndike.types import Algorithm, EnvSpec, Metrics, Needs, Number, Observation, Rollout
+from thorndike.types import Algorithm, EnvSpec, Metrics, Needs, Number, Observation, Rollout, Shared
 
 
 @runtime_checkable
@@ -146,7 +146,7 @@ class Noise(NamedTuple):
     """The random numbers of one step."""
 
     choice: Float[Array, "*T B"]
-    layers: PyTree
+    layers: Shared | tuple[()]
     """Of noisy layers ``[*T, N]``; nothing without."""
 
 
@@ -170,10 +170,12 @@ def deep_q(name: str, config: Settings, options: Options, spec: EnvSpec, network
         if not net.noise_size:
             return Noise(jax.random.uniform(key, (steps, spec.num_envs)), ())
         key_choice, key_layers = jax.random.split(key)
-        return Noise(jax.random.uniform(key_choice, (steps, spec.num_envs)), jax.random.normal(key_layers, (steps, net.noise_size)))
+        layers = Shared(jax.random.normal(key_layers, (steps, net.noise_size)))
+        return Noise(jax.random.uniform(key_choice, (steps, spec.num_envs)), layers)
 
     def act(actor: Actor, memory: PyTree, obs: Observation, noise: Noise) -> tuple[PyTree, Int[Array, " B"], PyTree]:
-        later, outputs = apply_step(net.network, net.drawn(actor.params, noise.layers), memory, obs)
+        layers = noise.layers.numbers if isinstance(noise.layers, Shared) else jnp.zeros(0)
+        later, outputs = apply_step(net.network, net.drawn(actor.params, layers), memory, obs)
         mask = allowed(obs) if has_mask(spec.observation_space) else None
         choice = epsilon_greedy(net.q(outputs, obs), actor.epsilon, noise.choice, random_ties=False, allowed=mask)
         return later, choice.action, {"memory": memory}

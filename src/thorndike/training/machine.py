@@ -6,6 +6,7 @@ import platform
 from collections.abc import Mapping
 from pathlib import Path
 
+from thorndike.startup import without_device_count
 from thorndike.training.json_files import Json
 
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "numpy", "gymnasium", "thorndike")
@@ -15,7 +16,7 @@ _VECTORS = ("sse", "avx", "fma", "f16c", "amx", "asimd", "sve", "neon")
 
 def machine() -> Json:
     """The processor, what it can do on vectors, XLA's options, and a hash of what a small program computes here. Starts JAX."""
-    flags = os.environ.get("XLA_FLAGS", "")
+    flags = without_device_count(os.environ.get("XLA_FLAGS", ""))
     return {"processor": _processor(), "features": _features(), "xla_flags": flags, "self_test": self_test()}
 
 

@@ -12,7 +12,7 @@ from jaxtyping import Array, Key, PyTree
 
 from thorndike.errors import UserError
 from thorndike.training.sources import to_environment
-from thorndike.types import Algorithm, EnvSpec, Observation, Step, Wrapper
+from thorndike.types import Algorithm, EnvSpec, Observation, Shared, Step, Wrapper
 
 
 class Policy:
@@ -107,8 +107,13 @@ class Policy:
         """Noise ``[size, ...]`` of one decision. The algorithm draws for its own number of environments, so several draws are joined."""
         each = self.spec.num_envs
         steps = -(-size // each)
-        drawn = self.algorithm.draw(key, steps)
-        return jax.tree.map(lambda x: x.reshape((steps * each, *x.shape[2:]))[:size], drawn)
+
+        def join(drawn: Array | Shared) -> Array | Shared:
+            if isinstance(drawn, Shared):
+                return Shared(drawn.numbers[0])
+            return drawn.reshape((steps * each, *drawn.shape[2:]))[:size]
+
+        return jax.tree.map(join, self.algorithm.draw(key, steps), is_leaf=lambda x: isinstance(x, Shared))
 
     def _see(self, statistics: PyTree, memory: PyTree, previous: Observation, obs: Observation) -> tuple[PyTree, Observation]:
         size = jax.tree.leaves(obs)[0].shape[0]

@@ -7,6 +7,7 @@ donated. Between segments the host logs, evaluates and saves. The random numbers
 
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -14,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key, PyTree, UInt32
 
+from thorndike.training.devices import over_devices, placed
 from thorndike.training.host_source import HostSource
 from thorndike.types import Algorithm, EpisodeStats, Metrics, Rollout, Source
 
@@ -93,12 +95,15 @@ def agent_keys(seed: int, indices: UInt32[Array, " S"]) -> AgentKeys:
     return AgentKeys(keys[:, 0], keys[:, 1], keys[:, 2])
 
 
-def runner(algorithm: Algorithm, source: Source | HostSource, seed: int, indices: Sequence[int]) -> Runner:
-    """Bind a learner to its source. ``indices`` name the agents of run ``seed``, usually ``range(S)``."""
+def runner(algorithm: Algorithm, source: Source | HostSource, seed: int, indices: Sequence[int], devices: int = 1) -> Runner:
+    """Bind a learner to its source. ``indices`` name the agents of run ``seed``, usually ``range(S)``.
+
+    With a compiled source, ``devices`` (which divide S) train a share of the agents each.
+    """
     plain = source.source if isinstance(source, HostSource) else source
     warmup = algorithm.needs.warmup_iterations
     spent = Stopwatch()
-    make = _compiled_segment if plain.compiled else _host_segment
+    make = partial(_compiled_segment, devices) if plain.compiled else _host_segment
     learning = make(algorithm, plain, algorithm.update, spent)
     warming = make(algorithm, plain, algorithm.observe, spent)
 
@@ -125,7 +130,7 @@ def runner(algorithm: Algorithm, source: Source | HostSource, seed: int, indices
         carry, later = learning(carry, first + until, count - until)
         return carry, Report(later.metrics, jax.tree.map(jnp.add, report.episodes, later.episodes))
 
-    inspect = _inspector(algorithm, plain) if plain.compiled else None
+    inspect = _inspector(algorithm, plain, devices) if plain.compiled else None
     per_iteration = algorithm.needs.rollout_length * plain.spec.num_envs
     return Runner(init, advance, per_iteration, lambda: spent.cpu, lambda: spent.wall, inspect)
 
@@ -167,11 +172,10 @@ def _page_keys(loop_key: Key[Array, ""], number: Int[Array, ""]) -> _PageKeys:
     return _PageKeys(*jax.random.split(jax.random.fold_in(loop_key, number)))
 
 
-def _inspector(algorithm: Algorithm, source: Source) -> Callable[[Carry, int], Rollout]:
+def _inspector(algorithm: Algorithm, source: Source, devices: int) -> Callable[[Carry, int], Rollout]:
     """One iteration's rollout, collected again without learning."""
     page = page_length(algorithm, source.spec.num_envs)
 
-    @jax.jit
     def all_seeds(carry: Carry, iteration: Int[Array, ""]) -> Rollout:
         def one(carry: Carry) -> Rollout:
             noise = source.draw(_page_keys(carry.loop_key, iteration // page).draw, page)
@@ -180,11 +184,12 @@ def _inspector(algorithm: Algorithm, source: Source) -> Callable[[Carry, int], R
 
         return over_seeds(one)(carry)
 
-    return lambda carry, iteration: all_seeds(carry, np.int32(iteration))
+    collect = jax.jit(over_devices(all_seeds, devices))
+    return lambda carry, iteration: collect(placed(carry, devices), np.int32(iteration))
 
 
 def _compiled_segment(
-    algorithm: Algorithm, source: Source, learn: Callable, spent: Stopwatch
+    devices: int, algorithm: Algorithm, source: Source, learn: Callable, spent: Stopwatch
 ) -> Callable[[Carry, int, int], tuple[Carry, Report]]:
     """Iterations scanned page by page: the random numbers of a page are drawn at once, outside the inner loop.
 
@@ -226,11 +231,11 @@ def _compiled_segment(
     def all_seeds(carry: Carry, first: Int[Array, ""], count: Int[Array, ""]) -> tuple[Carry, Report]:
         return over_seeds(lambda one: segment(one, first, count))(carry)
 
-    traced = jax.jit(all_seeds, donate_argnums=0)
+    traced = jax.jit(over_devices(all_seeds, devices), donate_argnums=0)
     programs: list[Callable] = []
 
     def run(carry: Carry, first: int, count: int) -> tuple[Carry, Report]:
-        numbers = np.int32(first), np.int32(count)
+        carry, numbers = placed(carry, devices), (np.int32(first), np.int32(count))
         if not programs:
             spent.start()
             programs.append(compile_segment(traced.lower(carry, *numbers)))

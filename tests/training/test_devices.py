@@ -1,0 +1,48 @@
+"""Seeds over several devices: shares of the same size, and the same bits whatever the number."""
+
+import hashlib
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from thorndike.errors import UserError
+from thorndike.startup import device_count, without_device_count
+from thorndike.training.devices import devices_for
+
+TRAIN_TWICE = """
+import sys
+from thorndike import startup
+startup.count_cores_as_devices(2)
+import thorndike as td
+settings = {"n_steps": 8, "batch_size": 16, "n_epochs": 1, "net_arch": (8,)}
+for devices in (1, 2):
+    td.train("ppo", "CartPole-v1", steps=64, seeds=4, num_envs=2, settings=settings, preset="none", devices=devices,
+             output=sys.argv[1], name=f"on{devices}")
+"""
+
+
+@pytest.mark.parametrize(("seeds", "at_most", "expected"), [(1, 8, 1), (8, 2, 2), (8, 3, 2), (9, 4, 3), (7, 4, 1), (4, 16, 4)])
+def test_every_device_gets_the_same_number_of_seeds(seeds, at_most, expected):
+    assert devices_for(seeds, at_most) == expected
+
+
+def test_a_seed_has_the_same_bits_on_one_device_and_on_two(tmp_path):
+    subprocess.run([sys.executable, "-c", TRAIN_TWICE, str(tmp_path)], check=True, capture_output=True)
+    one, two = (sorted(tmp_path.glob(f"*/*/*on{devices}/checkpoints/*/state.safetensors")) for devices in (1, 2))
+    assert [path.parent.name for path in one] == [path.parent.name for path in two] != []
+    assert [digest(path) for path in one] == [digest(path) for path in two]
+
+
+def test_more_devices_than_there_are_is_a_plain_mistake():
+    with pytest.raises(UserError, match="--devices 100: JAX has 1 here; ask for 1 to 1"):
+        device_count(100)
+
+
+def test_the_number_of_devices_is_no_difference_between_machines():
+    assert without_device_count("--a=1 --xla_force_host_platform_device_count=2 --b=2") == "--a=1 --b=2"
+
+
+def digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
