@@ -15,7 +15,6 @@ import pytest
 
 from thorndike.algorithms import (
     a2c,
-    bootstrapped_dqn,
     crossq,
     ddpg,
     dqn,
@@ -179,23 +178,6 @@ def dqn_for(iterations: int, spec: EnvSpec, learner=dqn, **parts) -> Algorithm:
     return getattr(learner, name)(learner.Config(**(config | parts)), spec)
 
 
-def bootstrapped_for(iterations: int, spec: EnvSpec) -> Algorithm:
-    config = bootstrapped_dqn.Config(
-        total_steps=iterations * NUM_ENVS,
-        learning_rate="linear(0.005, 0)",
-        buffer_size=4000,
-        learning_starts=200,
-        train_freq=NUM_ENVS,
-        gradient_steps=4,
-        batch_size=32,
-        target_update_interval=10 * NUM_ENVS,
-        gamma=GAMMA,
-        n_members=3,
-        net_arch=(16,),
-    )
-    return bootstrapped_dqn.bootstrapped_dqn(config, spec)
-
-
 def pqn_for(iterations: int, spec: EnvSpec, **settings) -> Algorithm:
     config = {"n_steps": 10, "batch_size": 80, "gamma": GAMMA, "learning_rate": "linear(0.01, 0)", "net_arch": (16,)}
     config |= {"exploration_final_eps": 0.2, "trace_decay": 0.5, "total_steps": iterations * 10 * NUM_ENVS}
@@ -259,7 +241,6 @@ SLOW_CASES = {
     "reinforce, Box": lambda: learn(BOX, partial(reinforce_for, 800, log_std_init=-2.0), 800),
     "dqn, double, dueling, 3 steps": lambda: learn(DISCRETE, partial(dqn_for, 1200, double=True, dueling=True, n_step=3), 1200),
     "rainbow": lambda: learn(DISCRETE, partial(dqn_for, 1200, learner=rainbow, v_min=-12.0, v_max=12.0, atoms=25), 1200),
-    "bootstrapped_dqn": lambda: learn(DISCRETE, partial(bootstrapped_for, 1200), 1200),
     "dqn, boltzmann": lambda: learn(DISCRETE, partial(dqn_for, 1200, exploration="boltzmann", temperature="linear(1, 0.1)"), 1200),
     "dqn, prioritised": lambda: learn(DISCRETE, partial(dqn_for, 1200, prioritized=True), 1200),
     "dqn, noisy": lambda: learn(DISCRETE, partial(dqn_for, 2000, noisy=True), 2000),
