@@ -15,6 +15,7 @@ from types import ModuleType
 from typing import TypeAlias
 
 import gymnasium
+import numpy as np
 from gymnasium.vector import VectorEnv
 from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 
@@ -52,12 +53,16 @@ def missing_package(id: str) -> str | None:
     if id.startswith(_ROBOTICS) and id not in gymnasium.registry and importlib.util.find_spec("gymnasium_robotics") is None:
         return f"{id} needs the robotics package: pip install 'thorndike[robotics]'"
     spec = gymnasium.registry.get(id)
-    robot = spec is not None and str(spec.entry_point).startswith(
-        ("gymnasium_robotics.envs.fetch", "gymnasium_robotics.envs.shadow_dexterous")
-    )
-    if robot and int(importlib.metadata.version("mujoco").partition(".")[0]) >= 4:
-        return f"{id} does not start on mujoco 4 (gymnasium-robotics 1.4.2 cannot read its joints there): pip install 'mujoco<4'"
+    arms = ("gymnasium_robotics.envs.fetch", "gymnasium_robotics.envs.shadow_dexterous")
+    if spec is not None and str(spec.entry_point).startswith(arms) and not _joints_are_numbers():
+        version = importlib.metadata.version("mujoco")
+        return f"{id} does not start on mujoco {version}, whose joints gymnasium-robotics cannot read: pip install mujoco==3.5.0"
     return None
+
+
+def _joints_are_numbers() -> bool:
+    """Whether mujoco's kinds of joints equal the numbers that a model has for them, as Gymnasium-robotics 1.4.2 takes for granted."""
+    return bool(np.int32(2) == importlib.import_module("mujoco").mjtJoint.mjJNT_SLIDE)
 
 
 def make_single(
