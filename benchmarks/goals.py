@@ -2,7 +2,7 @@
 
 python benchmarks/goals.py                both, into benchmarks/results/goals.json (a row each; other rows stay)
 python benchmarks/goals.py bits           BitFlip-v0 alone (two CPU-minutes)
-python benchmarks/goals.py fetch          FetchReach-v4 alone; needs gymnasium-robotics and mujoco below 4
+python benchmarks/goals.py fetch          FetchReach-v4 alone; needs gymnasium-robotics and mujoco 3.5.0
 python benchmarks/goals.py bits --steps 8000   a look at whether it runs
 """
 

@@ -117,3 +117,11 @@ def test_a_maze_of_gymnasium_robotics_is_found_by_its_id():
     finally:
         environment.close()
     np.testing.assert_array_equal(reward, [1.0, 0.0])
+
+
+def test_an_arm_that_this_mujoco_cannot_move_is_refused_with_advice(monkeypatch):
+    pytest.importorskip("gymnasium_robotics")
+    monkeypatch.setattr("thorndike.environments.origins._joints_are_numbers", lambda: False)
+    with pytest.raises(UserError, match="pip install mujoco==") as error:
+        td.make("FetchReach-v4")
+    assert "\n" not in str(error.value)

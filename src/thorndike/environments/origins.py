@@ -15,6 +15,7 @@ from types import ModuleType
 from typing import TypeAlias
 
 import gymnasium
+import numpy as np
 from gymnasium.vector import VectorEnv
 from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 
@@ -65,12 +66,18 @@ def _missing_family(id: str) -> str | None:
     spec = gymnasium.registry.get(id)
     where = str(spec.entry_point) if spec is not None else ""
     robot = where.startswith(("gymnasium_robotics.envs.fetch", "gymnasium_robotics.envs.shadow_dexterous"))
-    if robot and int(importlib.metadata.version("mujoco").partition(".")[0]) >= 4:
-        return f"{id} does not start on mujoco 4 (gymnasium-robotics 1.4.2 cannot read its joints there): pip install 'mujoco<4'"
+    if robot and not _joints_are_numbers():
+        version = importlib.metadata.version("mujoco")
+        return f"{id} does not start on mujoco {version}, whose joints gymnasium-robotics cannot read: pip install mujoco==3.5.0"
     for family, package in (("mujoco", "mujoco"), ("box2d", "Box2D")):
         if where.startswith(f"gymnasium.envs.{family}") and importlib.util.find_spec(package) is None:
             return f"{id} needs the package {package}: pip install 'thorndike[{family}]'"
     return None
+
+
+def _joints_are_numbers() -> bool:
+    """Whether mujoco's kinds of joints equal the numbers that a model has for them, as Gymnasium-robotics 1.4.2 takes for granted."""
+    return bool(np.int32(2) == importlib.import_module("mujoco").mjtJoint.mjJNT_SLIDE)
 
 
 def make_single(
