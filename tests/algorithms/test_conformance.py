@@ -188,7 +188,7 @@ def test_a_policy_acts_in_another_number_of_environments_than_it_learnt_in(case)
     size = 2 * NUM_ENVS + 1
 
     def decide(key):
-        policy = Policy(algorithm, wrappers.chain(*case.wrappers), source.spec, actors=(), statistics=(), best=0)
+        policy = Policy(algorithm, wrappers.chain(), source.spec, actors=(), statistics=(), best=0)
         obs = jax.tree.map(lambda x: jnp.broadcast_to(x, (size, *x.shape[1:])), example_observation(source.spec.observation_space))
         actor, memory, noise = algorithm.actor(algorithm.init(key)), algorithm.memory(size), policy.noise(key, size)
         return algorithm.act(actor, memory, obs, noise)[:2], algorithm.greedy(actor, memory, obs, noise)[:2]
