@@ -141,6 +141,9 @@ class Algorithm(NamedTuple):
     observe: Callable[[PyTree, Rollout, Key[Array, ""]], tuple[PyTree, Metrics]]
     """The same signature: store only, no learning (the warm-up segment)."""
     needs: Needs
+    dynamics: Callable[[PyTree, Observation], Metrics] | None = None
+    """State, observations ``[T, B, ...]`` of the latest rollout (``()`` for off-policy learners, which look into their replay) -> what is
+    logged at a few log points only: dead units, gradient norms by module, ... It changes nothing."""
 
 
 class Wrapper(NamedTuple):

@@ -27,6 +27,7 @@ from thorndike.functional.policy_losses import explained_variance, standardize, 
 from thorndike.functional.returns import generalized_advantage
 from thorndike.functional.schedules import schedule
 from thorndike.networks.heads import Shape, policy_network
+from thorndike.networks.hidden_layers import look_into_rollout
 from thorndike.networks.network import Network, NetworkBuilder, apply_rollout, apply_step, fresh_memory
 from thorndike.networks.recurrent import MEMORIES
 from thorndike.networks.torso import ACTIVATIONS, example_observation
@@ -138,4 +139,5 @@ def a2c(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) ->
         update=update,
         observe=lambda state, rollout, key: (state, {}),
         needs=Needs(rollout_length=config.n_steps, on_policy=True),
+        dynamics=lambda state, obs: look_into_rollout(net, state.params, obs, state.opt_state),
     )

@@ -23,6 +23,7 @@ from jaxtyping import Array, Float, Key
 
 from thorndike.functional.critic_losses import lowest, squared_errors
 from thorndike.functional.descent import Optimized, descend, every, optimized
+from thorndike.functional.learning_dynamics import mean_square_gradient
 from thorndike.functional.soft_policy import SoftPolicy, improve_policy, soft_policy, temperature
 from thorndike.functional.squashed_gaussian import sample_squashed, squashed_mode
 from thorndike.networks.batch_renorm import RenormalizedNetwork, renormalized_network
@@ -156,6 +157,13 @@ def crossq(config: Config, spec: EnvSpec) -> Algorithm:
     def outputs(acting: Acting, obs: Observation) -> Float[Array, "M D2"]:
         return policy.acting(acting.actor, acting.actor_moments, flat(obs))
 
+    def look(learnt: Learnt, batch: Transitions) -> Metrics:
+        own, judges = learnt.policy.actor, learnt.critics
+        squares, rows = mean_square_gradient(own.opt_state)[None], flat(batch.obs)
+        metrics = policy.look("actor", own.params[None], learnt.policy_moments[None], squares, rows)
+        rows = jnp.concatenate([rows, batch.action], axis=-1)
+        return metrics | net.look("critics", judges.params, learnt.critic_moments, mean_square_gradient(judges.opt_state), rows)
+
     method = Method(
         name="crossq",
         dimensions=dimensions,
@@ -166,5 +174,6 @@ def crossq(config: Config, spec: EnvSpec) -> Algorithm:
         value=lambda acting, obs: judge(acting.critics, acting.critic_moments, obs, squashed_mode(outputs(acting, obs))),
         draw=lambda key, updates: jax.random.normal(key, (updates, 2, config.batch_size, dimensions)),
         learn=learn,
+        look=look,
     )
     return off_policy(method, config, spec)

@@ -26,7 +26,7 @@ from thorndike.functional.critic_losses import chosen_critics, lowest, squared_e
 from thorndike.functional.descent import Optimized, descend, every, follow, optimized
 from thorndike.functional.soft_policy import SoftPolicy, Temperature, improve_policy, soft_policy, temperature
 from thorndike.functional.squashed_gaussian import sample_squashed, squashed_mode
-from thorndike.networks.continuous import box_dimensions, critics, policy_outputs
+from thorndike.networks.continuous import box_dimensions, critics, look_into_actor_critic, policy_outputs
 from thorndike.networks.network import NetworkBuilder
 from thorndike.networks.torso import ACTIVATIONS
 from thorndike.replay.off_policy import Method, Settings, off_policy
@@ -166,6 +166,7 @@ def soft_actor_critic(name: str, config: Settings, parts: Parts, spec: EnvSpec, 
         value=lambda acting, obs: parts.objective(net.apply(acting.critics, obs, greedy(acting, obs))),
         draw=draw,
         learn=learn,
+        look=lambda learnt, batch: look_into_actor_critic(policy, learnt.policy.actor, net, learnt.critics, batch.obs, batch.action),
     )
     return off_policy(method, config, spec)
 

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from thorndike.functional.action_distributions import ActionDistribution
 from thorndike.networks.dense import dense
+from thorndike.networks.hidden_layers import hidden_layers
 from thorndike.networks.masking import masked
 from thorndike.networks.network import Network, NetworkBuilder
 from thorndike.networks.recurrent import Remembering, remembering, side_by_side
@@ -207,4 +208,8 @@ def _remembering(spec: EnvSpec, shape: Shape, kernel_init: Callable[..., Array],
 
 
 def _pair(module: nn.Module) -> Network:
-    return Network(init=lambda key, obs: module.init(key, obs)["params"], apply=lambda params, obs: module.apply({"params": params}, obs))
+    return Network(
+        init=lambda key, obs: module.init(key, obs)["params"],
+        apply=lambda params, obs: module.apply({"params": params}, obs),
+        layers=hidden_layers(module),
+    )

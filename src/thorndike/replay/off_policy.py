@@ -10,9 +10,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
+from thorndike.functional.action_distributions import saturation
 from thorndike.functional.coloured_noise import coloured_noise
 from thorndike.functional.guards import accept_if, all_finite
 from thorndike.functional.schedules import schedule
+from thorndike.networks.hidden_layers import ROWS
+from thorndike.replay.age import key_to_look_by, mean_age
 from thorndike.replay.pace import pace
 from thorndike.replay.uniform import ReplayBuffer, Transitions, add, init_replay, row_shapes, sample
 from thorndike.types import Algorithm, EnvSpec, Metrics, Needs, Observation, Rollout
@@ -85,6 +88,8 @@ class Method(NamedTuple):
     """key, number of updates -> their random numbers, leading with the update. Consumes the key."""
     learn: Callable[[PyTree, Transitions, PyTree, Float[Array, ""], Int[Array, ""]], tuple[PyTree, Metrics]]
     """The learnt, a minibatch, random numbers of this update, learning rate, number of the update -> the learnt, metrics."""
+    look: Callable[[PyTree, Transitions], Metrics] | None = None
+    """The learnt, transitions -> dead units, effective rank, gradient norms of its networks."""
 
 
 class State(NamedTuple):
@@ -159,7 +164,14 @@ def off_policy(method: Method, config: Settings, spec: EnvSpec) -> Algorithm:
 
         learnt, metrics = repeated(one, state.learnt, plan.gradient_steps, state.updates >= 0)
         updates, metrics["train/learning_rate"] = state.updates + plan.gradient_steps, rate
+        metrics |= saturation(spec.action_space, rollout.action)
         return State(learnt, updates, replay, state.env_steps + per_iteration), metrics
+
+    def dynamics(state: State, obs: Observation) -> Metrics:
+        del obs
+        batch = sample(state.replay, key_to_look_by(state.env_steps), ROWS, spec.num_envs, 1, config.gamma)
+        networks = {} if method.look is None else method.look(state.learnt, batch)
+        return networks | {"train/replay_age": mean_age(state.replay, spec.num_envs)}
 
     return Algorithm(
         init=init,
@@ -172,4 +184,5 @@ def off_policy(method: Method, config: Settings, spec: EnvSpec) -> Algorithm:
         update=update,
         observe=observe,
         needs=Needs(rollout_length=plan.rollout_length, on_policy=False, warmup_iterations=plan.warmup_iterations),
+        dynamics=dynamics,
     )

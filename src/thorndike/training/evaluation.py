@@ -12,6 +12,7 @@ from thorndike.statistics import summary
 from thorndike.training.acting import acting
 from thorndike.training.host_source import HostEngine, Pool, environment_seeds
 from thorndike.training.policy import Policy
+from thorndike.training.time_shares import Clock
 
 _EVALUATION = 0x45564131
 """Separates the seeds of evaluation from those of training, whatever the run's seed is."""
@@ -54,7 +55,7 @@ def evaluate(
     num_envs = max(n for n in range(1, min(num_envs, episodes) + 1) if episodes % n == 0)
     engine = build(seeds * num_envs)
     try:
-        rows = _play(policy, Pool(engine, seeds, num_envs), episodes // num_envs, seed, deterministic)
+        rows = _play(policy, Pool(engine, seeds, num_envs, Clock()), episodes // num_envs, seed, deterministic)
     finally:
         engine.close()
     found = summary(np.array([[row.total for row in rows if row.seed == policy.first + i] for i in range(seeds)]))
