@@ -1,5 +1,7 @@
 """Dead units, effective rank and gradient norms against slow loops, and on features made to have them."""
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -92,6 +94,26 @@ def test_the_norms_by_module_are_the_roots_of_the_mean_squared_gradients(optimiz
     found = gradient_norms(mean_square_gradient(state))
     assert set(found) == {"train/grad_norm/torso", "train/grad_norm/policy"}
     assert float(found["train/grad_norm/torso"]) == pytest.approx(np.sqrt(mean / weight), rel=1e-4)
+
+
+class Parts(NamedTuple):
+    body: object
+    head: object
+
+
+@pytest.mark.parametrize(
+    ("tree", "modules"),
+    [
+        (2.0, {"all"}),
+        ([{"weight": 1.0, "bias": 1.0}, {"weight": 1.0}], {"0/weight", "0/bias", "1/weight"}),
+        ({"params": {"Dense_0": {"kernel": 1.0}, "Dense_1": {"kernel": 1.0}}}, {"Dense_0", "Dense_1"}),
+        (Parts({"a": 1.0}, 1.0), {"body", "head"}),
+        ([1.0, [1.0, 1.0]], {"0", "1/0", "1/1"}),
+    ],
+)
+def test_modules_of_trees_of_any_kind_have_names(tree, modules):
+    found = gradient_norms(jax.tree.map(jnp.asarray, tree))
+    assert set(found) == {f"train/grad_norm/{module}" for module in modules}
 
 
 def test_rmsprop_has_norms_too_and_an_optimiser_before_its_first_step_has_none():

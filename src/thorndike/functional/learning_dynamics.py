@@ -87,9 +87,14 @@ def gradient_norms(squares: PyTree, name: str | None = None) -> Metrics:
 
 
 def _module_of(path: tuple[object, ...]) -> str:
+    """Numbers up to the first name, and that name; Flax's collection ``params`` is none."""
     words: list[str] = []
     for key in path:
-        words.append(str(key.key) if isinstance(key, jax.tree_util.DictKey) else str(getattr(key, "idx", key)))
-        if isinstance(key, jax.tree_util.DictKey):
+        if isinstance(key, jax.tree_util.SequenceKey):
+            words.append(str(key.idx))
+            continue
+        name = str(key.key) if isinstance(key, jax.tree_util.DictKey) else str(getattr(key, "name", key))
+        words.append(name)
+        if name != "params":
             break
-    return "/".join(words) or "all"
+    return "/".join(word for word in words if word != "params") or "all"
