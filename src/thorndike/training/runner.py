@@ -62,9 +62,9 @@ class Report(NamedTuple):
 
 
 class Latest:
-    """The observations of a host engine's latest rollout ``[S, T, B, ...]``."""
+    """Holds a host engine's latest rollout ``[S, T, B, ...]``, once there is one."""
 
-    obs: Observation = ()
+    rollout: Rollout
 
 
 class Runner(NamedTuple):
@@ -215,7 +215,7 @@ def _dynamics(algorithm: Algorithm, source: Source, latest: Latest, spent: Stopw
     programs: list[Callable] = []
 
     def run(carry: Carry, iteration: int) -> Metrics:
-        seen = latest.obs if algorithm.needs.on_policy else ()
+        seen = latest.rollout.obs if algorithm.needs.on_policy and not source.compiled else ()
         arguments = carry if source.compiled else carry._replace(source=()), seen, np.int32(iteration)
         if not programs:
             spent.start()
@@ -326,7 +326,7 @@ def _apart(algorithm: Algorithm, learn: Callable) -> _Learners:
 def _host_segment(
     algorithm: Algorithm, source: Source, learn: Callable, spent: Stopwatch, clock: Clock | None, latest: Latest
 ) -> Callable[[Carry, int, int], tuple[Carry, Report]]:
-    """The same iterations, stepped from Python. ``latest`` is given the observations of the last one."""
+    """The same iterations, stepped from Python. ``latest`` is given the last rollout."""
     page = page_length(algorithm, source.spec.num_envs)
     held_apart = jax.default_backend() == "cpu" and not algorithm.needs.on_policy
     learners = (_apart if held_apart else _stacked)(algorithm, learn)
@@ -358,7 +358,7 @@ def _host_segment(
             if not seen:
                 seen.append(True)
                 spent.stop()
-        latest.obs, shares = rollout.obs, None if times is None else times.shares()
+        latest.rollout, shares = rollout, None if times is None else times.shares()
         metrics = jax.tree.map(lambda *rows: sum(rows) / len(rows), *[report.metrics for report in reports])
         episodes = jax.tree.map(lambda *rows: sum(rows), *[report.episodes for report in reports])
         return Carry(learners.give(held), state, loop_keys), Report(metrics, episodes, shares)
