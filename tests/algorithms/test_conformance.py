@@ -217,6 +217,22 @@ def test_types_are_strong_and_stay_as_they_are_over_an_update(case):
         assert all(leaf.shape == () for leaf in jax.tree.leaves(reported)), "metrics are reduced inside the program"
 
 
+WITHOUT_NETWORKS = (q_learning.q_learning,)
+
+
+@pytest.mark.parametrize("case", ALL.values(), ids=ALL)
+def test_every_learner_with_networks_says_how_they_fare(case):
+    algorithm, source = case.make()
+    assert (algorithm.dynamics is None) == (case.build in WITHOUT_NETWORKS)
+    if algorithm.dynamics is not None:
+        leading, example = (algorithm.needs.rollout_length, NUM_ENVS), example_observation(source.spec.observation_space)
+        obs = jax.tree.map(lambda x: jnp.broadcast_to(x[None], (*leading, *x.shape[1:])), example) if algorithm.needs.on_policy else ()
+        found = jax.eval_shape(algorithm.dynamics, jax.eval_shape(algorithm.init, jax.random.key(0)), obs)
+        assert {"dead_units", "effective_rank", "grad_norm"} <= {name.split("/")[1] for name in found}
+        assert ("train/replay_age" in found) == (not algorithm.needs.on_policy)
+        assert all((leaf.shape, leaf.dtype) == ((), jnp.float32) for leaf in jax.tree.leaves(found))
+
+
 class Bound(NamedTuple):
     name: str
     runner: Runner

@@ -25,7 +25,7 @@ from thorndike.training.run_directory import checkpoints, read_lines, read_run
 from thorndike.training.sealed_folders import intact
 
 ROOT = Path(__file__).parents[2]
-TIMES = ("wall_s", "cpu_s", "time/fps")
+TIMES = ("wall_s", "cpu_s", "time/fps", "time/environment", "time/acting", "time/learning", "time/waiting")
 KILLS_OF_A_RUN = 5
 """Then it is let run to its end and compared."""
 PPO = "--num-envs 4 --set n_steps=32 --set batch_size=64 --set n_epochs=2 --set net_arch=16"

@@ -33,7 +33,7 @@ from training.tiny_environments import PPO_SETTINGS, Corridor, InterruptedCorrid
 
 pytestmark = pytest.mark.usefixtures("quick_compile")
 SEEDS, NUM_ENVS = 2, 3
-TIMES = {"wall_s", "cpu_s", "time/fps"}
+TIMES = {"wall_s", "cpu_s", "time/fps", "time/environment", "time/acting", "time/learning", "time/waiting"}
 
 
 class NativeHost:

@@ -152,3 +152,25 @@ def test_the_pool_is_closed_even_after_a_failure():
     with pytest.raises(RuntimeError, match="fell over"):
         evaluate(policy_for(Corridor), lambda number: Failing([Corridor] * number, "Corridor"), 2)
     assert closed == [True]
+
+
+@pytest.mark.parametrize("mode", [None, *AutoresetMode])
+def test_values_of_first_observations_are_held_against_discounted_returns(mode):
+    """A slow loop plays the same episodes: a reward of ``age`` a step, deaths and limits in turn, whatever the engine's reset."""
+    policy, gamma = policy_for(Lengths), 0.9
+    build = partial(loop, Lengths) if mode is None else partial(vector, mode, Lengths)
+    found = evaluate(policy, build, 12, num_envs=2, gamma=gamma)
+    value = jax.jit(policy.algorithm.value)
+    for row in found.rows:
+        number = row.episode % 6
+        actor = jax.tree.map(lambda x, seed=row.seed: x[seed], policy.actors)
+        first, last = (np.asarray(value(actor, jnp.array([[age, number]], jnp.float32)))[0] for age in (0, row.length))
+        worth = sum(gamma**t * (t + 1) for t in range(row.length)) + (0 if row.terminated else gamma**row.length * last)
+        assert (row.value, row.discounted) == pytest.approx((first, worth), rel=1e-5)
+    by_seed = [np.mean([row.value - row.discounted for row in found.rows if row.seed == seed]) for seed in range(2)]
+    assert found.value_bias.per_seed == pytest.approx(by_seed)
+    assert found.value_bias.mean == pytest.approx(np.mean(by_seed))
+    assert found.value_bias.ci95[0] <= found.value_bias.mean <= found.value_bias.ci95[1]
+    without = evaluate(policy, build, 12, num_envs=2)
+    assert without.value_bias is None
+    assert [row[:5] for row in without.rows] == [row[:5] for row in found.rows]

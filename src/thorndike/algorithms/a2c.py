@@ -30,6 +30,7 @@ from thorndike.functional.returns import generalized_advantage
 from thorndike.functional.schedules import schedule
 from thorndike.networks.cnn import CNNS
 from thorndike.networks.heads import Shape, softmax_probabilities, stochastic_policy
+from thorndike.networks.hidden_layers import look_into_rollout
 from thorndike.networks.network import Network, NetworkBuilder, apply_rollout, apply_step, fresh_memory
 from thorndike.networks.recurrent import MEMORIES
 from thorndike.networks.torso import ACTIVATIONS, example_observation
@@ -145,5 +146,6 @@ def a2c(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) ->
         observe=lambda state, rollout, key: (state, {}),
         needs=Needs(rollout_length=config.n_steps, on_policy=True),
         probabilities=softmax_probabilities(net, spec.action_space),
+        dynamics=lambda state, obs: look_into_rollout(net, state.params, obs, state.opt_state),
     )
     return with_held_noise(algorithm, config.sde_sample_freq) if config.use_sde else algorithm

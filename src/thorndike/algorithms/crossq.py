@@ -23,6 +23,7 @@ from jaxtyping import Array, Float, Key
 
 from thorndike.functional.critic_losses import lowest, squared_errors
 from thorndike.functional.descent import Optimized, descend, every, optimized
+from thorndike.functional.learning_dynamics import mean_square_gradient
 from thorndike.functional.soft_policy import SoftPolicy, improve_policy, soft_policy, temperature
 from thorndike.functional.squashed_gaussian import sample_squashed, squashed_mode
 from thorndike.networks.batch_renorm import RenormalizedNetwork, renormalized_network
@@ -102,6 +103,17 @@ def joint_loss(
     return squared_errors(values, jax.lax.stop_gradient(target), batch.weight), (later, jnp.mean(values))
 
 
+def look_into_both(
+    learnt: Learnt, policy: RenormalizedNetwork, net: RenormalizedNetwork, rows: Float[Array, "M F"], action: Float[Array, "M D"]
+) -> Metrics:
+    """Dead units, effective rank and gradient norms of the policy and of the critics."""
+    own, judges = learnt.policy.actor, learnt.critics
+    squares, critic_squares = mean_square_gradient(own.opt_state)[None], mean_square_gradient(judges.opt_state)
+    metrics = policy.look("actor", own.params[None], learnt.policy_moments[None], squares, rows)
+    seen = jnp.concatenate([rows, action], axis=-1)
+    return metrics | net.look("critics", judges.params, learnt.critic_moments, critic_squares, seen)
+
+
 def crossq(config: Config, spec: EnvSpec) -> Algorithm:
     """CrossQ for an environment with Box actions. Raises ``UserError`` for other action spaces."""
     dimensions = box_dimensions("crossq", spec)
@@ -169,5 +181,6 @@ def crossq(config: Config, spec: EnvSpec) -> Algorithm:
         value=lambda acting, obs: judge(acting.critics, acting.critic_moments, obs, squashed_mode(outputs(acting, obs))),
         draw=lambda key, updates: jax.random.normal(key, (updates, 2, config.batch_size, dimensions)),
         learn=learn,
+        look=lambda learnt, batch: look_into_both(learnt, policy, net, flat(batch.obs), batch.action),
     )
     return off_policy(method, config, spec)

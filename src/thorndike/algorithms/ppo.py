@@ -40,6 +40,7 @@ from thorndike.functional.schedules import schedule
 from thorndike.functional.shuffling import minibatch_size, minibatches
 from thorndike.networks.cnn import CNNS
 from thorndike.networks.heads import Shape, softmax_probabilities, stochastic_policy
+from thorndike.networks.hidden_layers import look_into_rollout
 from thorndike.networks.network import Network, NetworkBuilder, apply_rollout, apply_step, as_rows, begins_episode, fresh_memory
 from thorndike.networks.recurrent import MEMORIES
 from thorndike.networks.torso import ACTIVATIONS, example_observation
@@ -104,15 +105,8 @@ class Minibatch(NamedTuple):
     """The memory before the first step ``[1, M, ...]``, or ``()``."""
 
 
-MINIBATCH_METRICS = (
-    "train/loss",
-    "train/policy_gradient_loss",
-    "train/value_loss",
-    "train/entropy_loss",
-    "train/approx_kl",
-    "train/clip_fraction",
-    "train/grad_norm",
-)
+_OF_A_MINIBATCH = ("loss", "policy_gradient_loss", "value_loss", "entropy_loss", "approx_kl", "clip_fraction", "grad_norm")
+MINIBATCH_METRICS = tuple(f"train/{name}" for name in _OF_A_MINIBATCH)
 
 
 def ppo_loss(
@@ -244,5 +238,6 @@ def ppo(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) ->
         observe=lambda state, rollout, key: (state, {}),
         needs=Needs(rollout_length=config.n_steps, on_policy=True),
         probabilities=softmax_probabilities(net, spec.action_space),
+        dynamics=lambda state, obs: look_into_rollout(net, state.params, obs, state.opt_state),
     )
     return with_held_noise(algorithm, config.sde_sample_freq) if config.use_sde else algorithm

@@ -34,6 +34,7 @@ from thorndike.functional.shuffling import minibatch_size, minibatches
 from thorndike.functional.temporal_difference import select
 from thorndike.networks.cnn import CNNS
 from thorndike.networks.heads import Shape, q_network
+from thorndike.networks.hidden_layers import look_into_rollout
 from thorndike.networks.masking import allowed, has_mask
 from thorndike.networks.network import Network, NetworkBuilder, as_rows, flattened
 from thorndike.networks.torso import ACTIVATIONS, example_observation
@@ -173,4 +174,5 @@ def pqn(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) ->
         update=update,
         observe=lambda state, rollout, key: (state, {}),
         needs=Needs(rollout_length=config.n_steps, on_policy=True),
+        dynamics=lambda state, obs: look_into_rollout(net, state.learnt.params, obs, state.learnt.opt_state),
     )

@@ -27,7 +27,14 @@ from thorndike.functional.descent import Optimized, descend, every, follow, opti
 from thorndike.functional.held_noise import noise_features, state_dependent_sample, with_held_noise
 from thorndike.functional.soft_policy import SoftPolicy, Temperature, improve_policy, soft_policy, temperature
 from thorndike.functional.squashed_gaussian import sample_squashed, squashed_mode
-from thorndike.networks.continuous import StateDependent, box_dimensions, critics, policy_outputs, state_dependent
+from thorndike.networks.continuous import (
+    StateDependent,
+    box_dimensions,
+    critics,
+    look_into_actor_critic,
+    policy_outputs,
+    state_dependent,
+)
 from thorndike.networks.network import NetworkBuilder
 from thorndike.networks.torso import ACTIVATIONS
 from thorndike.replay.hindsight import STRATEGIES
@@ -185,6 +192,7 @@ def soft_actor_critic(name: str, config: Settings, parts: Parts, spec: EnvSpec, 
         draw=draw,
         learn=learn,
         features=0 if smooth is None else noise_features(config.net_arch[-1]),
+        look=lambda learnt, batch: look_into_actor_critic(policy, learnt.policy.actor, net, learnt.critics, batch.obs, batch.action),
     )
     return off_policy(method, config, spec) if smooth is None else with_held_noise(off_policy(method, config, spec), smooth.sample_freq)
 

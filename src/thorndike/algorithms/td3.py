@@ -22,7 +22,7 @@ from jaxtyping import Array, Float, Key
 from thorndike.functional.critic_losses import lowest, squared_errors
 from thorndike.functional.descent import Optimized, descend, every, follow, optimized
 from thorndike.functional.policy_losses import weighted_mean
-from thorndike.networks.continuous import box_dimensions, critics, policy_outputs
+from thorndike.networks.continuous import box_dimensions, critics, look_into_actor_critic, policy_outputs
 from thorndike.networks.network import NetworkBuilder
 from thorndike.networks.torso import ACTIVATIONS
 from thorndike.replay.hindsight import STRATEGIES
@@ -169,6 +169,7 @@ def deterministic_actor_critic(name: str, config: Sizes, parts: Parts, spec: Env
         value=lambda acting, obs: lowest(net.apply(acting.critics, obs, policy(acting.actor, obs)))[:, 0],
         draw=lambda key, updates: jax.random.normal(key, (updates, config.batch_size, dimensions)),
         learn=learn,
+        look=lambda learnt, batch: look_into_actor_critic(outputs, learnt.policy.actor, net, learnt.critics, batch.obs, batch.action),
     )
 
 

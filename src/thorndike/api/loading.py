@@ -3,12 +3,14 @@
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
+from typing import cast
 
 import gymnasium
 
 from thorndike.api.building import EnvironmentLike
 from thorndike.api.policy_files import read_policy
 from thorndike.api.recorded_run import refuse_code
+from thorndike.api.value_scale import incomparable_values
 from thorndike.environments import registry
 from thorndike.environments.host.action_masks import mask_in_observation
 from thorndike.environments.host.atari import described
@@ -63,13 +65,19 @@ class LoadedPolicy:
         An environment without a time limit gets one of ``LONGEST_EPISODE`` steps.
         """
         build = reference_engines(self.choice(), self._policy.spec.observation_space)
-        found = evaluate(self._policy, build, episodes, seed, num_envs or 20, deterministic)
+        gamma = None if self.incomparable_values is not None else cast(float, self.facts["config"]["gamma"])
+        found = evaluate(self._policy, build, episodes, seed, num_envs or 20, deterministic, gamma)
         if self.run is not None:
             settings = {"evaluation_seed": seed, "deterministic": deterministic}
-            names = {"total": "return"}
+            names = {"total": "return", "discounted": "discounted_return"}
             rows = [{names.get(key, key): value for key, value in row._asdict().items()} for row in found.rows]
             append_lines(self.run / "evaluations.jsonl", [settings | row for row in rows])
         return found
+
+    @property
+    def incomparable_values(self) -> str | None:
+        """Why the learner's values cannot be held against the environment's rewards; None where they can."""
+        return incomparable_values(self.facts)
 
     def watch(self, path: str | Path | None = None, episodes: int = 1, seed: int = 0) -> Path | None:
         """Film episodes of the policy as mp4, or show them in a window if no path is given."""

@@ -28,7 +28,7 @@ from thorndike.training.session import Keeping, Start, run_session
 from thorndike.training.tree_files import named_arrays, read_arrays
 from thorndike.types import Wrapper
 
-TIMES = ("wall_s", "cpu_s", "time/fps")
+TIMES = ("wall_s", "cpu_s", "time/fps", "time/environment", "time/acting", "time/learning", "time/waiting")
 """What the clock says is no part of a run that could be made again."""
 _PARTS = {"0": "learner", "1": "environments"}
 

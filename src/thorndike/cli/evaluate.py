@@ -2,11 +2,15 @@
 
 from argparse import SUPPRESS
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from thorndike.cli.answer import Answer
 from thorndike.cli.find_run import add_run_arguments, find_run
 from thorndike.cli.parser import Parser, positive_whole, seed_number
 from thorndike.records import from_policy, read_policy_facts
+
+if TYPE_CHECKING:
+    from thorndike.training.evaluation import Bias
 
 EXAMPLES = """\
   thorndike eval latest
@@ -40,6 +44,7 @@ def run(words: Sequence[str]) -> Answer:
         "min": found.min,
         "ci95": found.ci95,
         "per_seed": found.per_seed,
+        "value_bias": None if found.value_bias is None else found.value_bias._asdict(),
     }
     low, high = found.ci95
     whose = "the only seed" if len(found.per_seed) == 1 else f"each of {len(found.per_seed)} seeds"
@@ -47,6 +52,13 @@ def run(words: Sequence[str]) -> Answer:
     text = (
         f"{found.environment}{protocol}, {found.episodes:,} episodes of {whose}\n"
         f"mean {found.mean:.4g} (95 % interval {low:.4g} to {high:.4g}), interquartile mean {found.iqm:.4g}, worst seed {found.min:.4g}\n"
-        f"per seed: {', '.join(f'{value:.4g}' for value in found.per_seed)}"
+        f"per seed: {', '.join(f'{value:.4g}' for value in found.per_seed)}\n" + _on_values(found.value_bias, policy.incomparable_values)
     )
     return Answer(data, text)
+
+
+def _on_values(bias: "Bias | None", why_not: str | None) -> str:
+    if bias is None:
+        return f"values against returns: left out, {why_not}"
+    low, high = bias.ci95
+    return f"values against returns: {bias.mean:+.4g} (95 % interval {low:+.4g} to {high:+.4g}); above 0, the learner expects too much"

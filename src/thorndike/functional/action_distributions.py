@@ -74,13 +74,13 @@ def _box_distribution(dimensions: int, kind: str, features: int) -> ActionDistri
 
 
 def saturation(space: gymnasium.Space, action: Shaped[Array, "..."]) -> dict[str, Float[Array, ""]]:
-    """``rollout/action_saturation``: the share of a Box's action numbers beyond [-1, 1], which the environment's bounds clip.
+    """``rollout/action_saturation``: the share of a Box's action numbers within 1 % of the bounds [-1, 1], or clipped to them.
 
     Near 1 the policy pushes against its bounds all the time. Nothing for other spaces.
     """
     if not isinstance(space, gymnasium.spaces.Box):
         return {}
-    return {"rollout/action_saturation": jnp.mean((jnp.abs(action) > 1.0).astype(jnp.float32))}
+    return {"rollout/action_saturation": jnp.mean((jnp.abs(action) > 0.99).astype(jnp.float32))}
 
 
 def categorical(n: int) -> ActionDistribution:

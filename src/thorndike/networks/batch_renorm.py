@@ -10,10 +10,11 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Float, Key, PyTree
 
+from thorndike.networks.hidden_layers import SHOWN, look_into_ensemble
 from thorndike.networks.torso import ACTIVATIONS, torch_uniform
-from thorndike.types import Number
+from thorndike.types import Metrics, Number
 
 MOMENTUM, EPSILON = 0.99, 1e-3
 MAX_RATIO, MAX_SHIFT = 3.0, 5.0
@@ -69,6 +70,7 @@ class RenormalizedMLP(nn.Module):
         x = BatchRenorm(self.warmup)(x, learning)
         for width in self.hidden:
             x = ACTIVATIONS[self.activation](nn.Dense(width, kernel_init=torch_uniform)(x))
+            self.sow(SHOWN, self.activation, x)
             x = BatchRenorm(self.warmup)(x, learning)
         return nn.Dense(self.outputs, kernel_init=torch_uniform)(x)
 
@@ -82,6 +84,9 @@ class RenormalizedNetwork(NamedTuple):
     """parameters, moments, rows -> outputs by the batch's own moments, the running moments after it."""
     acting: Callable[[Float[Array, " P"], Float[Array, " S"], Float[Array, "M F"]], Float[Array, "M outputs"]]
     """parameters, moments, rows -> outputs by the running moments: each row's depends on that row alone."""
+    look: Callable[[str, Float[Array, "K P"], Float[Array, "K S"], Float[Array, "K P"], Float[Array, "M F"]], Metrics]
+    """name, parameters and moments of ``K`` networks, their mean squared gradients, rows -> dead units, effective rank, gradient norms:
+    the mean over the networks."""
 
 
 def renormalized_network(inputs: int, outputs: int, hidden: Sequence[int], activation: str, warmup: Number | int) -> RenormalizedNetwork:
@@ -90,6 +95,7 @@ def renormalized_network(inputs: int, outputs: int, hidden: Sequence[int], activ
     example = jnp.zeros((1, inputs))
     template = jax.eval_shape(lambda key: module.init(key, example, True), jax.random.key(0))
     empty = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), template)
+    size = ravel_pytree(empty["params"])[0].shape[0]
     of_params, of_moments = ravel_pytree(empty["params"])[1], ravel_pytree(empty["batch_stats"])[1]
 
     def init(key: Key[Array, ""]) -> tuple[Float[Array, " P"], Float[Array, " S"]]:
@@ -104,4 +110,11 @@ def renormalized_network(inputs: int, outputs: int, hidden: Sequence[int], activ
     def acting(params: Array, moments: Array, rows: Array) -> Array:
         return jnp.asarray(module.apply({"params": of_params(params), "batch_stats": of_moments(moments)}, rows, False))
 
-    return RenormalizedNetwork(init, learning, acting)
+    def look(name: str, params: Array, moments: Array, squares: Array, rows: Array) -> Metrics:
+        def layers(held: Float[Array, " PS"]) -> PyTree:
+            variables = {"params": of_params(held[:size]), "batch_stats": of_moments(held[size:])}
+            return module.apply(variables, rows, False, mutable=[SHOWN])[1][SHOWN]
+
+        return look_into_ensemble(name, layers, of_params, jnp.concatenate([params, moments], axis=1), squares)
+
+    return RenormalizedNetwork(init, learning, acting, look)

@@ -7,6 +7,7 @@ from jaxtyping import Array, Float
 
 from thorndike.networks.convolution import Convolution, max_pool
 from thorndike.networks.dense import dense
+from thorndike.networks.hidden_layers import SHOWN
 
 CNNS = ("nature", "impala")
 """The choices of a ``cnn`` setting."""
@@ -59,4 +60,6 @@ class CNN(nn.Module):
         return Convolution(channels, size, stride, self.kernel_init, same, name=f"Conv_{number}")
 
     def _activated(self, x: Float[Array, "*B F"]) -> Float[Array, "*B F"]:
-        return nn.relu(nn.LayerNorm()(x) if self.layer_norm else x)
+        x = nn.relu(nn.LayerNorm()(x) if self.layer_norm else x)
+        self.sow(SHOWN, "relu", x)
+        return x

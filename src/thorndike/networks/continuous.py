@@ -9,14 +9,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Float, Key, PyTree
 
 from thorndike.errors import UserError
+from thorndike.functional.descent import Optimized
 from thorndike.functional.held_noise import noise_features, state_dependent_parameters, with_constant
+from thorndike.functional.learning_dynamics import mean_square_gradient
+from thorndike.networks.hidden_layers import SHOWN, hidden_layers, look_into, look_into_ensemble
 from thorndike.networks.masking import observed, without_mask
 from thorndike.networks.network import Network, NetworkBuilder, flattened
 from thorndike.networks.torso import ACTIVATIONS, Torso, example_observation, flatten_observation, is_image, torch_uniform
-from thorndike.types import EnvSpec, Number, Observation
+from thorndike.types import EnvSpec, Metrics, Number, Observation
 
 
 class PolicyOutputs(nn.Module):
@@ -56,6 +59,7 @@ class ActionValue(nn.Module):
         for width in self.hidden:
             x = nn.Dense(width, kernel_init=torch_uniform)(x)
             x = ACTIVATIONS[self.activation](nn.LayerNorm()(x) if self.layer_norm else x)
+            self.sow(SHOWN, self.activation, x)
         return nn.Dense(self.outputs, kernel_init=torch_uniform)(x)
 
 
@@ -88,6 +92,8 @@ class Critics(NamedTuple):
     """key -> parameters. Consumes the key."""
     apply: Callable[[Float[Array, "K P"], Observation, Float[Array, "M D"]], Float[Array, "K M outputs"]]
     """parameters of all critics, or of some ``[k, P]``, observation, action -> values."""
+    look: Callable[[Optimized, Observation, Float[Array, "M D"]], Metrics]
+    """what is learnt ``[K, P]``, observation, action -> dead units, effective rank, gradient norms: the mean over the critics."""
 
 
 def box_dimensions(algorithm: str, spec: EnvSpec) -> int:
@@ -118,7 +124,11 @@ def policy_outputs(
         )
     start = 0.0 if exploration is None else exploration.log_std_init
     module = PolicyOutputs(spec.observation_space, outputs, tuple(hidden), activation, exploration is not None, start)
-    made = Network(lambda key, obs: module.init(key, obs)["params"], lambda params, obs: module.apply({"params": params}, obs))
+    made = Network(
+        lambda key, obs: module.init(key, obs)["params"],
+        lambda params, obs: module.apply({"params": params}, obs),
+        layers=hidden_layers(module),
+    )
     network = made if given is None else given(spec, outputs)
     if network.recurrence is not None:
         raise UserError("this learner's policy has no memory: give a network without recurrence, or use ppo, a2c, reinforce or dqn")
@@ -136,7 +146,7 @@ def critics(
     """
     module = ActionValue(spec.observation_space, tuple(hidden), activation, outputs, layer_norm)
     example = example_observation(spec.observation_space), jnp.zeros((1, dimensions))
-    template = jax.eval_shape(module.init, jax.random.key(0), *example)
+    template, shown = jax.eval_shape(module.init, jax.random.key(0), *example), hidden_layers(module)
     _, unravel = ravel_pytree(jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), template))
 
     def init(key: Key[Array, ""]) -> Float[Array, "K P"]:
@@ -145,4 +155,18 @@ def critics(
     def apply(params: Float[Array, "K P"], obs: Observation, action: Float[Array, "M D"]) -> Float[Array, "K M outputs"]:
         return jax.vmap(lambda flat: jnp.asarray(module.apply(unravel(flat), obs, action)))(params)
 
-    return Critics(init, apply)
+    def look(learnt: Optimized, obs: Observation, action: Float[Array, "M D"]) -> Metrics:
+        def layers(flat: Float[Array, " P"]) -> PyTree:
+            return shown(unravel(flat)["params"], obs, action)
+
+        squares = mean_square_gradient(learnt.opt_state)
+        return look_into_ensemble("critics", layers, lambda flat: unravel(flat)["params"], learnt.params, squares)
+
+    return Critics(init, apply, look)
+
+
+def look_into_actor_critic(
+    policy: Network, actor: Optimized, judges: Critics, learnt: Optimized, obs: Observation, action: Float[Array, "M D"]
+) -> Metrics:
+    """Dead units, effective rank and gradient norms of a policy of flat parameters (as ``actor``) and of its critics."""
+    return look_into(policy, actor.params, obs, mean_square_gradient(actor.opt_state), "actor") | judges.look(learnt, obs, action)

@@ -13,6 +13,7 @@ from thorndike.errors import UserError
 from thorndike.functional.action_distributions import ActionDistribution, action_distribution
 from thorndike.functional.held_noise import noise_features, state_dependent_parameters, with_constant
 from thorndike.networks.dense import dense
+from thorndike.networks.hidden_layers import hidden_layers
 from thorndike.networks.masking import masked
 from thorndike.networks.network import Network, NetworkBuilder, apply_step
 from thorndike.networks.recurrent import Remembering, remembering, side_by_side
@@ -254,7 +255,11 @@ def _remembering(spec: EnvSpec, shape: Shape, kernel_init: Callable[..., Array],
 
 
 def _pair(module: nn.Module) -> Network:
-    return Network(init=lambda key, obs: module.init(key, obs)["params"], apply=lambda params, obs: module.apply({"params": params}, obs))
+    return Network(
+        init=lambda key, obs: module.init(key, obs)["params"],
+        apply=lambda params, obs: module.apply({"params": params}, obs),
+        layers=hidden_layers(module),
+    )
 
 
 def softmax_probabilities(network: Network, space: gymnasium.Space) -> Callable[[PyTree, PyTree, Observation], Float[Array, "*B n"]] | None:

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from thorndike.networks.heads import combined
+from thorndike.networks.hidden_layers import hidden_layers
 from thorndike.networks.network import Network
 from thorndike.networks.torso import ACTIVATIONS, MLP, Torso, torch_uniform
 from thorndike.types import Observation
@@ -51,7 +52,9 @@ def implicit_network(
 ) -> Network:
     """The network of pairs ``(obs, fractions)``."""
     module = ImplicitQuantiles(space, actions, tuple(hidden), activation, dueling, cnn)
+    look = hidden_layers(module)
     return Network(
         init=lambda key, seen: module.init(key, *seen)["params"],
         apply=lambda params, seen: module.apply({"params": params}, *seen),
+        layers=lambda params, seen: look(params, *seen),
     )

@@ -23,6 +23,10 @@ class Recurrence(NamedTuple):
     ``[T, B, ...]``, outputs ``[T, B, ...]``."""
 
 
+def _as_it_is(params: PyTree) -> PyTree:
+    return params
+
+
 class Network(NamedTuple):
     """A function of the observation with parameters."""
 
@@ -32,6 +36,10 @@ class Network(NamedTuple):
     """parameters, observation ``[B, ...]`` -> outputs: ``[B, A]`` for Q-values, ``([B, P], [B])`` for a policy and a value. One with memory
     answers as at the beginning of an episode."""
     recurrence: Recurrence | None = None
+    layers: Callable[[PyTree, Observation], PyTree] | None = None
+    """parameters, observation -> what the hidden layers put out (``hidden_layers.py``); None of a network that does not say."""
+    modules: Callable[[PyTree], PyTree] = _as_it_is
+    """parameters, or anything shaped like them -> a tree whose first names are the network's modules."""
 
 
 NetworkBuilder: TypeAlias = Callable[[EnvSpec, int], Network]
@@ -95,7 +103,7 @@ def with_outputs(network: Network, change: Callable[[PyTree, Observation], PyTre
         memories, outputs = inner.unroll(params, memory, obs, begins)
         return memories, change(outputs, obs)
 
-    return Network(network.init, apply, Recurrence(inner.fresh, step, unroll))
+    return network._replace(apply=apply, recurrence=Recurrence(inner.fresh, step, unroll))
 
 
 def as_rows(tree: PyTree) -> PyTree:
@@ -111,15 +119,16 @@ def flattened(network: Network, example: Observation) -> Network:
     def apply(flat: Array, obs: Observation) -> PyTree:
         return network.apply(unravel(flat), obs)
 
+    look = network.layers
+    layers = None if look is None else lambda flat, obs: look(unravel(flat), obs)
+    plain = Network(network.init, apply, layers=layers, modules=lambda flat: network.modules(unravel(flat)))
     if network.recurrence is None:
-        return Network(network.init, apply)
+        return plain
     fresh, step, unroll = network.recurrence
-    return Network(
-        network.init,
-        apply,
-        Recurrence(
+    return plain._replace(
+        recurrence=Recurrence(
             fresh,
             lambda flat, memory, obs: step(unravel(flat), memory, obs),
             lambda flat, memory, obs, begins: unroll(unravel(flat), memory, obs, begins),
-        ),
+        )
     )

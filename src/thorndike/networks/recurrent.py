@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
+from thorndike.networks.hidden_layers import hidden_layers
 from thorndike.networks.network import Network, Recurrence, as_rows
 from thorndike.networks.torso import Torso
 from thorndike.types import Observation
@@ -147,7 +148,7 @@ def remembering(module: Remembering) -> Network:
     def apply(params: PyTree, obs: Observation) -> PyTree:
         return step(params, fresh(jax.tree.leaves(obs)[0].shape[0]), obs)[1]
 
-    return Network(init, apply, Recurrence(fresh, step, unroll))
+    return Network(init, apply, Recurrence(fresh, step, unroll), hidden_layers(module, module.encode))
 
 
 def side_by_side(first: Network, second: Network) -> Network:
@@ -171,4 +172,7 @@ def side_by_side(first: Network, second: Network) -> Network:
         both = one.unroll(params[0], memory[0], obs, begins), other.unroll(params[1], memory[1], obs, begins)
         return both[0][:1] + both[1][:1], both[0][1:] + both[1][1:]
 
-    return Network(init, apply, Recurrence(lambda batch: (one.fresh(batch), other.fresh(batch)), step, unroll))
+    def layers(params: PyTree, obs: Observation) -> PyTree:
+        return {str(i): look(params[i], obs) for i, look in enumerate((first.layers, second.layers)) if look is not None}
+
+    return Network(init, apply, Recurrence(lambda batch: (one.fresh(batch), other.fresh(batch)), step, unroll), layers)

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from thorndike.errors import UserError
 from thorndike.networks.cnn import CNN
 from thorndike.networks.dense import dense
+from thorndike.networks.hidden_layers import SHOWN
 from thorndike.networks.masking import observed, without_mask
 from thorndike.types import Observation
 
@@ -38,6 +39,7 @@ class MLP(nn.Module):
         for width in self.hidden:
             x = dense(width, self.kernel_init)(x)
             x = ACTIVATIONS[self.activation](nn.LayerNorm()(x) if self.layer_norm else x)
+            self.sow(SHOWN, self.activation, x)
         if self.outputs is None:
             return x
         return dense(self.outputs, self.output_init or self.kernel_init)(x)

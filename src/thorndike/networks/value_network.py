@@ -114,11 +114,16 @@ def _implicit(
     plain = implicit_network(spec.observation_space, actions, shape.net_arch, shape.activation, form.dueling, shape.cnn)
     example = (example_observation(spec.observation_space), jnp.zeros((1, outputs)))
 
-    def apply(weights: PyTree, obs: Observation) -> PyTree:
+    def with_levels(obs: Observation) -> tuple[Observation, Array]:
         rows = jax.tree.leaves(obs)[0].shape[0]
-        return plain.apply(weights, (obs, jnp.broadcast_to(midpoints(LEVELS_TO_ACT_BY)[None], (rows, LEVELS_TO_ACT_BY))))
+        return obs, jnp.broadcast_to(midpoints(LEVELS_TO_ACT_BY)[None], (rows, LEVELS_TO_ACT_BY))
 
-    acting = Network(plain.init, apply)
+    look = plain.layers
+    acting = Network(
+        plain.init,
+        lambda weights, obs: plain.apply(weights, with_levels(obs)),
+        layers=None if look is None else lambda weights, obs: look(weights, with_levels(obs)),
+    )
     return _with_noise(plain, acting, example, form, lambda weights, obs, fractions: plain.apply(weights, (obs, fractions)), judge)
 
 

@@ -15,16 +15,19 @@ from jaxtyping import Array, Float, Int, Key, PyTree
 from thorndike.errors import UserError
 from thorndike.functional.distributional import ReturnDistribution, expected_value
 from thorndike.functional.exploration import boltzmann, epsilon_greedy, epsilon_greedy_probabilities
+from thorndike.functional.learning_dynamics import mean_square_gradient
 from thorndike.functional.schedules import Rate, schedule
 from thorndike.functional.value_loss import Munchausen, Rule
 from thorndike.networks.heads import Shape
+from thorndike.networks.hidden_layers import look_into
 from thorndike.networks.masking import allowed, has_mask
 from thorndike.networks.network import NetworkBuilder, apply_step, fresh_memory
 from thorndike.networks.value_network import Form, value_network
+from thorndike.replay.age import key_to_look_by
 from thorndike.replay.frames import once_each, stacks_of
 from thorndike.replay.hindsight import Hindsight, replay_for
 from thorndike.replay.pace import Pace, pace
-from thorndike.replay.replay import Replay, Ring, prioritized_replay, sequence_replay, uniform_replay
+from thorndike.replay.replay import Replay, Ring, prioritized_replay, replayed_observations, sequence_replay, uniform_replay
 from thorndike.replay.uniform import row_shapes
 from thorndike.replay.value_learning import Parts, State, begin, begin_anew, learn, move_target
 from thorndike.types import Algorithm, EnvSpec, Metrics, Needs, Number, Observation, Rollout, Shared
@@ -219,6 +222,13 @@ def deep_q(name: str, config: Settings, options: Options, spec: EnvSpec, network
             state = begin_anew(parts, state, due, keys[-1])
         return state, metrics | explored | {"train/learning_rate": rate}
 
+    def dynamics(state: State, obs: Observation) -> Metrics:
+        del obs
+        seen = replayed_observations(parts.replay, state.replay, key_to_look_by(state.env_steps), config.batch_size)
+        squares = net.means(mean_square_gradient(state.opt_state))
+        networks = look_into(net.network, net.means(state.params), seen, squares)
+        return networks if parts.replay.age is None else networks | {"train/replay_age": parts.replay.age(state.replay)}
+
     return Algorithm(
         init=partial(begin, parts),
         actor=actor,
@@ -232,6 +242,7 @@ def deep_q(name: str, config: Settings, options: Options, spec: EnvSpec, network
         needs=Needs(rollout_length=plan.rollout_length, on_policy=False, warmup_iterations=plan.warmup_iterations),
         # Noisy layers act by a draw of their weights: nobody can say how often which action comes first.
         probabilities=probabilities if not net.noise_size and options.temperature is None else None,
+        dynamics=dynamics,
     )
 
 

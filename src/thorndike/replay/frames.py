@@ -92,7 +92,9 @@ def once_each(stacks: Stacks, ring: Ring, build: Callable[[Ring], Replay]) -> Re
     def learnt(replay: FrameReplay, draw: Draw, errors: Float[Array, " M"]) -> FrameReplay:
         return replay._replace(happened=inner.learnt(replay.happened, draw, errors))
 
-    return Replay(init, add, sample, learnt)
+    inner_age = inner.age
+    age = None if inner_age is None else lambda replay: inner_age(replay.happened)
+    return Replay(init, add, sample, learnt, age)
 
 
 def _write(

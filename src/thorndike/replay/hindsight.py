@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from thorndike.errors import UserError
+from thorndike.replay.age import mean_age
 from thorndike.replay.prioritized import Draw
 from thorndike.replay.replay import Replay, Ring, uniform_replay
 from thorndike.replay.uniform import ReplayBuffer, Transitions, add, drawn_rows, init_replay, transitions_at
@@ -66,7 +67,13 @@ def replay_for(ring: Ring, batch_size: int, gamma: Number, hindsight: Hindsight,
         batch = sample_hindsight(replay, key, batch_size, ring.num_envs, gamma, hindsight, goal_of(spec))
         return Draw(batch, jnp.zeros((0,), jnp.int32), jnp.ones((batch_size,), jnp.float32))
 
-    return Replay(partial(init_hindsight, *ring), add_hindsight, draw, lambda replay, draw, errors: replay)
+    return Replay(
+        partial(init_hindsight, *ring),
+        add_hindsight,
+        draw,
+        lambda replay, draw, errors: replay,
+        age=lambda replay: mean_age(replay.ring, ring.num_envs),
+    )
 
 
 def goal_of(spec: EnvSpec) -> Goal:

@@ -10,9 +10,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
+from thorndike.functional.action_distributions import saturation
 from thorndike.functional.coloured_noise import coloured_noise
 from thorndike.functional.guards import accept_if, all_finite
 from thorndike.functional.schedules import schedule
+from thorndike.replay.age import key_to_look_by
 from thorndike.replay.hindsight import Hindsight, replay_for
 from thorndike.replay.pace import pace
 from thorndike.replay.replay import Ring
@@ -102,6 +104,8 @@ class Method(NamedTuple):
     """The learnt, a minibatch, random numbers of this update, learning rate, number of the update -> the learnt, metrics."""
     features: int = 0
     """H: above 0, exploration depends on the state; its noise is ``[M, H, D]`` and comes as ``HeldNoise``."""
+    look: Callable[[PyTree, Transitions], Metrics] | None = None
+    """The learnt, transitions -> dead units, effective rank, gradient norms of its networks."""
 
 
 class State(NamedTuple):
@@ -182,7 +186,14 @@ def off_policy(method: Method, config: Settings, spec: EnvSpec) -> Algorithm:
 
         learnt, metrics = repeated(one, state.learnt, plan.gradient_steps, state.updates >= 0)
         updates, metrics["train/learning_rate"] = state.updates + plan.gradient_steps, rate
+        metrics |= saturation(spec.action_space, rollout.action)
         return State(learnt, updates, replay, state.env_steps + per_iteration), metrics
+
+    def dynamics(state: State, obs: Observation) -> Metrics:
+        del obs
+        batch = memory.sample(state.replay, key_to_look_by(state.env_steps), jnp.ones(())).batch
+        networks = {} if method.look is None else method.look(state.learnt, batch)
+        return networks if memory.age is None else networks | {"train/replay_age": memory.age(state.replay)}
 
     return Algorithm(
         init=init,
@@ -195,4 +206,5 @@ def off_policy(method: Method, config: Settings, spec: EnvSpec) -> Algorithm:
         update=update,
         observe=observe,
         needs=Needs(rollout_length=plan.rollout_length, on_policy=False, warmup_iterations=plan.warmup_iterations),
+        dynamics=dynamics,
     )

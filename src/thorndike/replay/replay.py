@@ -4,12 +4,16 @@ from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PyTree
 
+from thorndike.networks.hidden_layers import ROWS
+from thorndike.networks.network import as_rows
+from thorndike.replay.age import mean_age
 from thorndike.replay.prioritized import Draw, add_prioritized, init_prioritized, sample_prioritized, update_priorities
 from thorndike.replay.uniform import ReplayBuffer, add, init_replay, sample, sample_sequences
-from thorndike.types import Number, Rollout
+from thorndike.types import Number, Observation, Rollout
 
 
 class Ring(NamedTuple):
@@ -30,6 +34,8 @@ class Replay(NamedTuple):
     """memory, key, how far importance weights undo priorities (beta) -> minibatch. Consumes the key."""
     learnt: Callable[[PyTree, Draw, Float[Array, " M"]], PyTree]
     """memory, a minibatch, its errors -> memory."""
+    age: Callable[[PyTree], Float[Array, ""]] | None = None
+    """memory -> how many environment steps ago what is drawn was stored, on average."""
 
 
 def uniform_replay(ring: Ring, batch_size: int, n_step: int, gamma: Number) -> Replay:
@@ -39,7 +45,7 @@ def uniform_replay(ring: Ring, batch_size: int, n_step: int, gamma: Number) -> R
         del beta
         return _unweighted(sample(buffer, key, batch_size, ring.num_envs, n_step, gamma), batch_size)
 
-    return Replay(partial(init_replay, *ring), add, draw, _as_it_is)
+    return Replay(partial(init_replay, *ring), add, draw, _as_it_is, partial(mean_age, num_envs=ring.num_envs))
 
 
 def sequence_replay(ring: Ring, count: int, length: int) -> Replay:
@@ -49,7 +55,7 @@ def sequence_replay(ring: Ring, count: int, length: int) -> Replay:
         del beta
         return _unweighted(sample_sequences(buffer, key, count, length, ring.num_envs), length * count)
 
-    return Replay(partial(init_replay, *ring), add, draw, _as_it_is)
+    return Replay(partial(init_replay, *ring), add, draw, _as_it_is, partial(mean_age, num_envs=ring.num_envs))
 
 
 def prioritized_replay(ring: Ring, batch_size: int, n_step: int, gamma: Number, alpha: Number) -> Replay:
@@ -59,7 +65,19 @@ def prioritized_replay(ring: Ring, batch_size: int, n_step: int, gamma: Number, 
         add=partial(add_prioritized, n_step=n_step),
         sample=lambda replay, key, beta: sample_prioritized(replay, key, batch_size, ring.num_envs, n_step, gamma, beta),
         learnt=lambda replay, draw, errors: update_priorities(replay, draw.rows, errors, alpha),
+        age=lambda replay: mean_age(replay.ring, ring.num_envs, replay.levels[0]),
     )
+
+
+def replayed_observations(replay: Replay, memory: PyTree, key: Key[Array, ""], batch_size: int) -> Observation:
+    """``ROWS`` observations or a few more, ``[N, ...]``, of as many minibatches as it takes. Consumes the key."""
+    keys = jax.random.split(key, -(-ROWS // batch_size))
+
+    def one(key: Key[Array, ""]) -> Observation:
+        batch = replay.sample(memory, key, jnp.ones(())).batch
+        return as_rows(batch.obs) if isinstance(batch, Rollout) else batch.obs
+
+    return as_rows(jax.vmap(one)(keys))
 
 
 def _unweighted(batch: PyTree, rows: int) -> Draw:

@@ -32,6 +32,7 @@ from thorndike.training.host_source import (
     fresh_state,
 )
 from thorndike.training.notices import notice
+from thorndike.training.time_shares import Clock
 from thorndike.types import Algorithm, EpisodeStats, Noise, Observation, Rollout, Source, Step, Wrapper
 
 SCHEDULES = ("fixed", "free")
@@ -169,7 +170,7 @@ class Lane:
         return self._pool.reset(self._seeds_of(self._segment, self.number, self._renewed))
 
     def _as_pool(self, engine: HostEngine) -> Pool:
-        return Pool(engine, self._seeds, engine.spec.num_envs // self._seeds)
+        return Pool(engine, self._seeds, engine.spec.num_envs // self._seeds, Clock())
 
 
 class Crew:

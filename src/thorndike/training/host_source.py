@@ -12,6 +12,7 @@ from jaxtyping import Array, Key, PyTree
 
 from thorndike.training.acting import Acting, acting
 from thorndike.training.sources import FOR_WRAPPERS, by_iteration
+from thorndike.training.time_shares import Clock
 from thorndike.types import Algorithm, EnvSpec, EpisodeStats, Noise, Observation, Rollout, Source, Step, Wrapper
 
 
@@ -53,6 +54,8 @@ class HostSource(NamedTuple):
     source: Source
     restart: Callable[[PyTree, int], PyTree]
     """wrappers' statistics ``[S, ...]``, rollouts made -> the state that an uninterrupted run had there."""
+    clock: Clock | None = None
+    """How long the engine and the device took so far, in ``collect``."""
 
 
 class Pool(NamedTuple):
@@ -61,15 +64,19 @@ class Pool(NamedTuple):
     engine: HostEngine
     seeds: int
     num_envs: int
+    clock: Clock
 
     def reset(self, seeds: Sequence[int]) -> Observation:
         """First observations ``[S, B, ...]``."""
-        return jax.tree.map(self._by_seed, self.engine.reset(seeds))
+        with self.clock.environment:
+            return jax.tree.map(self._by_seed, self.engine.reset(seeds))
 
     def step(self, action: Array) -> Step:
         """Actions ``[S, B, ...]`` -> Step ``[S, B, ...]``."""
-        host = np.asarray(action)
-        return jax.tree.map(self._by_seed, self.engine.step(host.reshape((self.seeds * self.num_envs, *host.shape[2:]))))
+        with self.clock.waiting:
+            host = np.asarray(action)
+        with self.clock.environment:
+            return jax.tree.map(self._by_seed, self.engine.step(host.reshape((self.seeds * self.num_envs, *host.shape[2:]))))
 
     def _by_seed(self, x: np.ndarray) -> np.ndarray:
         return x.reshape((self.seeds, self.num_envs, *x.shape[1:]))
@@ -124,7 +131,7 @@ def host_source(
     """
     seeds, length = len(indices), algorithm.needs.rollout_length
     spec = engine.spec._replace(num_envs=engine.spec.num_envs // seeds)
-    pool = Pool(engine, seeds, spec.num_envs)
+    pool = Pool(engine, seeds, spec.num_envs, Clock())
     moves = acting(algorithm, wrapper, spec.action_space, seeds, spec.num_envs)
     learn = jax.jit(jax.vmap(wrapper.learn)) if wrapper.name else lambda *unchanged: unchanged
 
@@ -159,7 +166,7 @@ def host_source(
         spec=wrapper.spec(spec),
         compiled=False,
     )
-    return HostSource(source, start)
+    return HostSource(source, start, pool.clock)
 
 
 def fresh_state(moves: Acting, statistics: PyTree, obs: Observation, collected: int) -> HostSourceState:

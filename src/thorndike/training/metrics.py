@@ -58,20 +58,21 @@ class MetricsLog:
 
     def write(self, report: Report, steps: int) -> LogPoint:
         """Fetch a segment's report (waiting for it if need be) and log it as of ``steps`` environment steps a seed."""
-        metrics, episodes = jax.tree.map(np.asarray, tuple(report))
+        metrics, episodes = jax.tree.map(np.asarray, (report.metrics, report.episodes))
         values = {name: _numbers(value) for name, value in sorted(metrics.items())}
         with np.errstate(divide="ignore", invalid="ignore"):
             values["rollout/ep_rew_mean"] = _numbers(episodes.return_sum / episodes.episodes)
             values["rollout/ep_len_mean"] = _numbers(episodes.length_sum / episodes.episodes)
         values["rollout/episodes"] = _numbers(episodes.episodes)
         point = LogPoint(steps, self.wall_s, self.cpu_s, values)
-        fps = self._steps_per_second(point)
-        self._unwritten.append({"steps": steps, "wall_s": point.wall_s, "cpu_s": point.cpu_s, "time/fps": fps, **values})
+        shares = {} if report.shares is None else report.shares._asdict()
+        times = {"time/fps": self._steps_per_second(point), **{f"time/{name}": share for name, share in shares.items()}}
+        self._unwritten.append({"steps": steps, "wall_s": point.wall_s, "cpu_s": point.cpu_s, **times, **values})
         try:
             self._append()
         except OSError as error:
             self._tell(error)
-        self._mirror(point, fps)
+        self._mirror(point, times)
         return point
 
     def sync(self) -> None:
@@ -89,13 +90,13 @@ class MetricsLog:
             notice(f"{self._path} cannot be written: {error.strerror}; training goes on, the lines are kept and written once they can be")
         self._told = True
 
-    def _mirror(self, point: LogPoint, fps: float | None) -> None:
+    def _mirror(self, point: LogPoint, times: dict[str, float | None]) -> None:
         """The means over seeds, for TensorBoard."""
         if self._events is None:
             return
         means = {name: [number for number in numbers if number is not None] for name, numbers in point.values.items()}
         try:
-            for name, finite in [*means.items(), ("time/fps", [] if fps is None else [fps])]:
+            for name, finite in [*means.items(), *((name, [] if value is None else [value]) for name, value in times.items())]:
                 if finite:
                     self._events.scalar(name, float(np.mean(finite)), point.steps)
             self._events.flush()

@@ -14,6 +14,7 @@ from thorndike.training.datasets import Episode
 from thorndike.training.host_source import HostEngine, Pool, environment_seeds
 from thorndike.training.policy import Policy
 from thorndike.training.sources import to_environment
+from thorndike.training.time_shares import Clock
 from thorndike.types import Observation, Step
 
 _RECORDING = 0x52454344
@@ -66,7 +67,7 @@ def record_episodes(
         number = max(n for n in range(1, min(num_envs, wanted.episodes) + 1) if wanted.episodes % n == 0)
     engine = build(number)
     try:
-        return _Recorder(policy, Pool(engine, 1, number), behavior, seed).play(wanted)
+        return _Recorder(policy, Pool(engine, 1, number, Clock()), behavior, seed).play(wanted)
     finally:
         engine.close()
 

@@ -8,7 +8,7 @@ donated. Between segments the host logs, evaluates and saves. The random numbers
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,8 @@ from jaxtyping import Array, Float, Int, Key, PyTree, UInt32
 
 from thorndike.training.devices import over_devices, placed
 from thorndike.training.host_source import HostSource
-from thorndike.types import Algorithm, EpisodeStats, Metrics, Rollout, Source
+from thorndike.training.time_shares import Clock, SegmentTimes, Shares
+from thorndike.types import Algorithm, EpisodeStats, Metrics, Observation, Rollout, Source
 
 _ROWS_OF_A_PAGE = 1_024
 RUN_ONCE = {"xla_backend_optimization_level": 0}
@@ -57,6 +58,14 @@ class Report(NamedTuple):
 
     metrics: dict[str, Float[Array, " S"]]
     episodes: EpisodeStats
+    shares: Shares | None = None
+    """Where the time of a segment on a host engine went; a compiled one is a single program."""
+
+
+class Latest:
+    """Holds a host engine's latest rollout ``[S, T, B, ...]``, once there is one."""
+
+    rollout: Rollout
 
 
 class Runner(NamedTuple):
@@ -74,6 +83,9 @@ class Runner(NamedTuple):
     inspect: Callable[[Carry, int], Rollout] | None = None
     """carry, iteration -> the rollout ``[S, T, B, ...]`` that this iteration will learn from; the carry is kept. None for host engines,
     which check what they return as it comes."""
+    dynamics: Callable[[Carry, int], Metrics] | None = None
+    """carry, the iteration it has come to -> what is logged at a few log points only ``[S]``; the carry is kept. None for learners that
+    have none."""
 
 
 def run_keys(seed: int, indices: UInt32[Array, " S"]) -> Key[Array, " S"]:
@@ -100,10 +112,11 @@ def runner(algorithm: Algorithm, source: Source | HostSource, seed: int, indices
 
     With a compiled source, ``devices`` (which divide S) train a share of the agents each.
     """
-    plain = source.source if isinstance(source, HostSource) else source
+    plain, clock = (source.source, source.clock) if isinstance(source, HostSource) else (source, None)
     warmup = algorithm.needs.warmup_iterations
     spent = Stopwatch()
-    make = partial(_compiled_segment, devices) if plain.compiled else _host_segment
+    latest = Latest()
+    make = partial(_compiled_segment, devices) if plain.compiled else partial(_host_segment, clock=clock, latest=latest)
     learning = make(algorithm, plain, algorithm.update, spent)
     warming = make(algorithm, plain, algorithm.observe, spent)
 
@@ -128,11 +141,12 @@ def runner(algorithm: Algorithm, source: Source | HostSource, seed: int, indices
         if until == count:
             return carry, report
         carry, later = learning(carry, first + until, count - until)
-        return carry, Report(later.metrics, jax.tree.map(jnp.add, report.episodes, later.episodes))
+        return carry, later._replace(episodes=jax.tree.map(jnp.add, report.episodes, later.episodes))
 
     inspect = _inspector(algorithm, plain, devices) if plain.compiled else None
     per_iteration = algorithm.needs.rollout_length * plain.spec.num_envs
-    return Runner(init, advance, per_iteration, lambda: spent.cpu, lambda: spent.wall, inspect)
+    dynamics = None if algorithm.dynamics is None else _dynamics(algorithm, plain, latest, spent, devices if plain.compiled else 1)
+    return Runner(init, advance, per_iteration, lambda: spent.cpu, lambda: spent.wall, inspect, dynamics)
 
 
 def over_seeds(function: Callable) -> Callable:
@@ -172,20 +186,51 @@ def _page_keys(loop_key: Key[Array, ""], number: Int[Array, ""]) -> _PageKeys:
     return _PageKeys(*jax.random.split(jax.random.fold_in(loop_key, number)))
 
 
-def _inspector(algorithm: Algorithm, source: Source, devices: int) -> Callable[[Carry, int], Rollout]:
-    """One iteration's rollout, collected again without learning."""
+def _collected_again(algorithm: Algorithm, source: Source) -> Callable[[Carry, Int[Array, ""]], Rollout]:
+    """One iteration's rollout of one seed, collected without learning from it."""
     page = page_length(algorithm, source.spec.num_envs)
 
-    def all_seeds(carry: Carry, iteration: Int[Array, ""]) -> Rollout:
-        def one(carry: Carry) -> Rollout:
-            noise = source.draw(_page_keys(carry.loop_key, iteration // page).draw, page)
-            now = jax.tree.map(lambda x: x[iteration % page], noise)
-            return source.collect(carry.source, algorithm.actor(carry.learner), now)[1]
+    def one(carry: Carry, iteration: Int[Array, ""]) -> Rollout:
+        noise = source.draw(_page_keys(carry.loop_key, iteration // page).draw, page)
+        now = jax.tree.map(lambda x: x[iteration % page], noise)
+        return source.collect(carry.source, algorithm.actor(carry.learner), now)[1]
 
-        return over_seeds(one)(carry)
+    return one
 
-    collect = jax.jit(over_devices(all_seeds, devices))
+
+def _inspector(algorithm: Algorithm, source: Source, devices: int) -> Callable[[Carry, int], Rollout]:
+    again = _collected_again(algorithm, source)
+    collect = jax.jit(over_devices(lambda carry, iteration: over_seeds(lambda one: again(one, iteration))(carry), devices))
     return lambda carry, iteration: collect(placed(carry, devices), np.int32(iteration))
+
+
+def _dynamics(algorithm: Algorithm, source: Source, latest: Latest, spent: Stopwatch, devices: int) -> Callable[[Carry, int], Metrics]:
+    """One small program, compiled when it is first asked for.
+
+    On-policy learners are shown the rollout that they learn from next or, of a host engine, which cannot make it twice, the last one.
+    """
+    again, look = _collected_again(algorithm, source), cast(Callable[[PyTree, Observation], Metrics], algorithm.dynamics)
+    collects = source.compiled and algorithm.needs.on_policy
+
+    def one(carry: Carry, obs: Observation, iteration: Int[Array, ""]) -> Metrics:
+        return look(carry.learner, again(carry, iteration).obs if collects else obs)
+
+    def all_seeds(carry: Carry, obs: Observation, iteration: Int[Array, ""]) -> Metrics:
+        return over_seeds(lambda carry, obs: one(carry, obs, iteration))(carry, obs)
+
+    traced = jax.jit(over_devices(all_seeds, devices))
+    programs: list[Callable] = []
+
+    def run(carry: Carry, iteration: int) -> Metrics:
+        seen = latest.rollout.obs if algorithm.needs.on_policy and not source.compiled else ()
+        arguments = placed(carry, devices) if source.compiled else carry._replace(source=()), seen, np.int32(iteration)
+        if not programs:
+            spent.start()
+            programs.append(compile_segment(traced.lower(*arguments)))
+            spent.stop()
+        return programs[0](*arguments)
+
+    return run
 
 
 def _compiled_segment(
@@ -295,9 +340,9 @@ def _apart(algorithm: Algorithm, learn: Callable) -> _Learners:
 
 
 def _host_segment(
-    algorithm: Algorithm, source: Source, learn: Callable, spent: Stopwatch
+    algorithm: Algorithm, source: Source, learn: Callable, spent: Stopwatch, clock: Clock | None, latest: Latest
 ) -> Callable[[Carry, int, int], tuple[Carry, Report]]:
-    """The same iterations, stepped from Python."""
+    """The same iterations, stepped from Python. ``latest`` is given the last rollout."""
     page = page_length(algorithm, source.spec.num_envs)
     on_cpu, replays = jax.default_backend() == "cpu", not algorithm.needs.on_policy
     stacked, alone, apart = (hold(algorithm, learn) for hold in (_stacked, _alone, _apart))
@@ -315,18 +360,25 @@ def _host_segment(
         learners = few if on_cpu and replays else stacked
         held, state, loop_keys = learners.take(carry.learner), carry.source, carry.loop_key
         reports: list[Report] = []
+        times = None if clock is None else SegmentTimes(clock)
         for iteration in range(first, first + count):
             if not seen:
                 spent.start()
             noise, keys = prepare_all(loop_keys, np.int32(iteration))
-            state, rollout, episodes = source.collect(state, learners.actors(held), noise)
+            actors = learners.actors(held)
+            began = time.perf_counter()
+            state, rollout, episodes = source.collect(state, actors, noise)
+            collected = time.perf_counter()
             held, metrics = learners.learn(held, rollout, keys)
+            if times is not None:
+                times.add(collected - began, time.perf_counter() - collected)
             reports.append(Report(metrics, episodes))
             if not seen:
                 seen.append(True)
                 spent.stop()
+        latest.rollout, shares = rollout, None if times is None else times.shares()
         metrics = jax.tree.map(lambda *rows: sum(rows) / len(rows), *[report.metrics for report in reports])
         episodes = jax.tree.map(lambda *rows: sum(rows), *[report.episodes for report in reports])
-        return Carry(learners.give(held), state, loop_keys), Report(metrics, episodes)
+        return Carry(learners.give(held), state, loop_keys), Report(metrics, episodes, shares)
 
     return run

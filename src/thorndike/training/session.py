@@ -18,6 +18,8 @@ from thorndike.training.run_directory import refuse_if_gone
 from thorndike.training.runner import Carry, Report, Runner
 from thorndike.training.stopping import saving, stop_requests
 
+FIRST_LOOK, LOOK_EVERY = 10, 5
+"""In log points; there are a hundred in a run."""
 RECENT = 10
 """Log points over which the best seed is chosen: a tenth of a run."""
 
@@ -30,6 +32,14 @@ class Plan(NamedTuple):
     checkpoint_every: int
     also: tuple[int, ...] = ()
     """Further iterations, rising, at which a line is logged and a checkpoint is due."""
+
+    def looks(self, iteration: int) -> bool:
+        """Whether learning dynamics are logged at an iteration: at every fifth log point from the tenth on.
+
+        Late and seldom, so that a short run never compiles what it takes, and a long one spends next to nothing on it.
+        """
+        point, rest = divmod(iteration, self.log_every)
+        return rest == 0 and point >= FIRST_LOOK and point % LOOK_EVERY == 0
 
     def next_stop(self, iteration: int) -> int:
         """Where the segment that begins at an iteration ends."""
@@ -135,6 +145,8 @@ class _Session:
             if stopped() is None or not self._on_host:
                 raise
             return False
+        if self._plan.looks(until) and self._runner.dynamics is not None:
+            report = report._replace(metrics=report.metrics | self._runner.dynamics(self.carry, until))
         self._settle()
         self._waiting, self.iteration = (report, until * self._runner.steps_per_iteration), until
         return True

@@ -94,6 +94,8 @@ def varied(build: Build, forms: Mapping[str, str], kept: Algorithm, first: LaneS
         value=lambda actor, obs: of(actor).value(actor.inner, obs),
         update=update,
         observe=observe,
+        # Lanes have no log to keep it in.
+        dynamics=None,
     )
 
 
