@@ -9,6 +9,7 @@ from thorndike.cli.answer import Answer
 from thorndike.cli.environment_names import check_environment
 from thorndike.cli.parser import Parser, positive_whole
 from thorndike.cli.train import (
+    add_devices_argument,
     add_training_arguments,
     check_preset,
     given_env_kwargs,
@@ -29,6 +30,7 @@ def run(words: Sequence[str]) -> Answer:
     parser = Parser("bench", "Measure steps per second on this machine, learning included, compilation apart.", EXAMPLES)
     algorithm = named_algorithm(words)
     add_training_arguments(parser, read_config_fields(algorithm) if algorithm in ALGORITHMS else {})
+    add_devices_argument(parser)
     parser.add_argument("--repeat", type=positive_whole, default=3, help="runs to measure (default: 3)")
     options = parser.parse(words)
     algorithm, environment = names(options)

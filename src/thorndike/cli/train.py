@@ -114,14 +114,18 @@ def add_training_arguments(parser: Parser, fields: Mapping[str, FieldFacts]) -> 
     )
     parser.add_argument("--engine", choices=ENGINES, default="auto", help="what steps the environment (default: the fastest that can)")
     parser.add_argument("--device", choices=DEVICES, default="auto", help="where learning is computed (default: chosen by size)")
-    parser.add_argument(
-        "--devices", type=positive_whole, metavar="N", help="how many devices (a CPU's cores) share the seeds at most (default: all)"
-    )
     taken = set(parser._option_string_actions)
     for name in fields:
         flag = "--" + name.replace("_", "-")
         if flag not in taken:
             parser.add_argument(flag, metavar="VALUE", dest=_SETTING + name, help=SUPPRESS)
+
+
+def add_devices_argument(parser: Parser) -> None:
+    """`--devices`; `train` and `bench` have it."""
+    parser.add_argument(
+        "--devices", type=positive_whole, metavar="N", help="how many devices (a CPU's cores) share the seeds at most (default: all)"
+    )
 
 
 def _add_old_hands_flags(parser: Parser) -> None:
@@ -232,6 +236,7 @@ def _parse(words: Sequence[str]) -> Namespace:
     algorithm = named_algorithm(words)
     add_training_arguments(parser, read_config_fields(algorithm) if algorithm in ALGORITHMS else {})
     add_output_argument(parser)
+    add_devices_argument(parser)
     parser.add_argument(
         "--wrap",
         action="append",

@@ -61,6 +61,11 @@ def missing_package(id: str) -> str | None:
     return _missing_family(id)
 
 
+def starts_here(id: str) -> bool:
+    """Whether the reference environment of an id that EnvPool has can be made: Gymnasium-robotics' cannot everywhere."""
+    return not id.startswith(_ROBOTICS) or (is_known_id(id) and missing_package(id) is None)
+
+
 def _missing_family(id: str) -> str | None:
     """The same for the families that Gymnasium registers whether their package is there or not."""
     spec = gymnasium.registry.get(id)
@@ -77,7 +82,8 @@ def _missing_family(id: str) -> str | None:
 
 def _joints_are_numbers() -> bool:
     """Whether mujoco's kinds of joints equal the numbers that a model has for them, as Gymnasium-robotics 1.4.2 takes for granted."""
-    return bool(np.int32(2) == importlib.import_module("mujoco").mjtJoint.mjJNT_SLIDE)
+    # In this order: NumPy's own comparison finds them equal where mujoco's, which Gymnasium-robotics comes upon, does not.
+    return bool(importlib.import_module("mujoco").mjtJoint.mjJNT_SLIDE == np.int32(2))
 
 
 def make_single(

@@ -163,9 +163,9 @@ def reference(choice: Choice, render_mode: str | None = None) -> "gymnasium.Env"
 
 def environment_ids() -> dict[str, list[str]]:
     """Every id by the engine that ``auto`` would choose; tables count as ``gymnasium`` here, for they are known only once made."""
-    from thorndike.environments.origins import gymnasium
+    from thorndike.environments.origins import gymnasium, starts_here
 
-    pool = sorted(_automatic_pool_ids())
+    pool = sorted(id for id in _automatic_pool_ids() if starts_here(id))
     taken = {*NATIVE, *pool}
     return {
         "native": sorted(NATIVE),

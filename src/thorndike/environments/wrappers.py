@@ -326,9 +326,15 @@ def from_settings(settings: Sequence[Mapping]) -> Wrapper:
 
 
 def build_wrapper(settings: Mapping) -> Wrapper:
-    """The wrapper that a ``Wrapper.settings`` describes. Raises UserError for a name that has no wrapper."""
+    """The wrapper that a ``Wrapper.settings`` describes.
+
+    Raises UserError for a name that has no wrapper, KeyError or TypeError for settings that are none.
+    """
     values = {key: value for key, value in settings.items() if key != "name"}
-    return from_settings(values["parts"]) if settings.get("name") == "chain" else builder(str(settings.get("name")))(**values)
+    name = settings["name"]
+    if not isinstance(name, str):
+        raise TypeError(f"a wrapper's name is text, not {name!r}")
+    return from_settings(values["parts"]) if name == "chain" else builder(name)(**values)
 
 
 def wrap(environment: Environment, wrapper: Wrapper) -> Environment:
