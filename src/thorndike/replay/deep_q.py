@@ -222,8 +222,8 @@ def deep_q(name: str, config: Settings, options: Options, spec: EnvSpec, network
             state = begin_anew(parts, state, due, keys[-1])
         return state, metrics | explored | {"train/learning_rate": rate}
 
-    def dynamics(state: State, obs: Observation) -> Metrics:
-        del obs
+    def dynamics(state: State, rollout: PyTree) -> Metrics:
+        del rollout
         seen = replayed_observations(parts.replay, state.replay, key_to_look_by(state.env_steps), config.batch_size)
         squares = net.means(mean_square_gradient(state.opt_state))
         networks = look_into(net.network, net.means(state.params), seen, squares)
