@@ -18,7 +18,7 @@ import jax
 import pytest
 
 from thorndike.cli.main import VERBS, main
-from thorndike.settings import read_config_fields
+from thorndike.config_fields import read_config_fields
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = sorted(str(path.relative_to(ROOT)) for path in [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from thorndike.algorithms import ALGORITHMS
+from thorndike.config_fields import fields_in_source, read_config_fields
 from thorndike.errors import UserError
 from thorndike.functional.schedules import schedule
-from thorndike.settings import AtLeast, Between, MoreThan, OneOf, check, fields_in_source, parse_settings, read_config_fields
+from thorndike.settings import AtLeast, Between, MoreThan, OneOf, check, parse_settings
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import TypeVar, cast
 
 from thorndike.algorithms import ALGORITHMS
+from thorndike.config_fields import read_config_fields
 from thorndike.errors import UserError
-from thorndike.settings import check_value, find_setting, read_config_fields
+from thorndike.settings import check_value, find_setting
 from thorndike.suggestions import did_you_mean
 from thorndike.training.json_files import (
     FLAG,

@@ -165,9 +165,9 @@ class Algorithm(NamedTuple):
     probabilities: Callable[[PyTree, PyTree, Observation], Float[Array, "*batch actions"]] | None = None
     """Actor, memory, obs -> the probability of each Discrete action under ``act``; None where it is not known."""
 
-    dynamics: Callable[[PyTree, Observation], Metrics] | None = None
-    """State, observations ``[T, B, ...]`` of the latest rollout (``()`` for off-policy learners, which look into their replay) -> what is
-    logged at a few log points only: dead units, gradient norms by module, ... It changes nothing."""
+    dynamics: Callable[[PyTree, PyTree], Metrics] | None = None
+    """State, the latest rollout (``()`` for learners with a replay, who look into that) -> what is logged at a few log points only: dead
+    units, gradient norms by module, ... It changes nothing."""
 
 
 def _as_they_are(statistics: PyTree, key: Key[Array, ""]) -> PyTree:

@@ -225,11 +225,16 @@ def test_every_learner_with_networks_says_how_they_fare(case):
     algorithm, source = case.make()
     assert (algorithm.dynamics is None) == (case.build in WITHOUT_NETWORKS)
     if algorithm.dynamics is not None:
-        leading, example = (algorithm.needs.rollout_length, NUM_ENVS), example_observation(source.spec.observation_space)
-        obs = jax.tree.map(lambda x: jnp.broadcast_to(x[None], (*leading, *x.shape[1:])), example) if algorithm.needs.on_policy else ()
-        found = jax.eval_shape(algorithm.dynamics, jax.eval_shape(algorithm.init, jax.random.key(0)), obs)
+        replays = not algorithm.needs.on_policy and not isinstance(case, DataCase)
+
+        def found_of(key):
+            state, noise = algorithm.init(key), jax.tree.map(lambda leaf: leaf[0], source.draw(key, 1))
+            rollout = source.collect(source.init(key), algorithm.actor(state), noise)[1]
+            return algorithm.dynamics(state, () if replays else rollout)
+
+        found = jax.eval_shape(found_of, jax.random.key(0))
         assert {"dead_units", "effective_rank", "grad_norm"} <= {name.split("/")[1] for name in found}
-        assert ("train/replay_age" in found) == (not algorithm.needs.on_policy)
+        assert ("train/replay_age" in found) == replays
         assert all((leaf.shape, leaf.dtype) == ((), jnp.float32) for leaf in jax.tree.leaves(found))
 
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from thorndike.algorithms import ALGORITHMS
 from thorndike.cli.main import VERBS
-from thorndike.settings import read_config_fields
+from thorndike.config_fields import read_config_fields
 
 
 class Mistake(NamedTuple):

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from thorndike.config_fields import read_config_fields
 from thorndike.errors import UserError
-from thorndike.settings import read_config_fields
 from thorndike.training.sweep_ranges import Search, Swept, chosen_search, listed_trials, over_texts, swept_settings
 
 PPO = read_config_fields("ppo")

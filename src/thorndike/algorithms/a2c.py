@@ -146,6 +146,6 @@ def a2c(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) ->
         observe=lambda state, rollout, key: (state, {}),
         needs=Needs(rollout_length=config.n_steps, on_policy=True),
         probabilities=softmax_probabilities(net, spec.action_space),
-        dynamics=lambda state, obs: look_into_rollout(net, state.params, obs, state.opt_state),
+        dynamics=lambda state, rollout: look_into_rollout(net, state.params, rollout.obs, state.opt_state),
     )
     return with_held_noise(algorithm, config.sde_sample_freq) if config.use_sde else algorithm

@@ -127,5 +127,6 @@ def awac(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) -
         value=lambda acting, obs: value(acting.critics, obs, policy.mode(acting.actor, obs)),
         draw=lambda key, updates: jax.random.normal(key, (updates, 2, config.batch_size, dimensions)),
         learn=learn,
+        look=lambda learnt, batch: policy.look(learnt.actor, batch.obs) | net.look(learnt.critics, batch.obs, batch.action),
     )
     return offline(method, config, spec, config.gamma) if spec.engine == "dataset" else off_policy(method, config, spec)

@@ -83,5 +83,6 @@ def bc(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) -> 
         value=lambda params, obs: jnp.zeros(jax.tree.leaves(obs)[0].shape[:1]),
         draw=lambda key, updates: jnp.zeros((updates, 0)),
         learn=learn,
+        look=lambda learnt, batch: policy.look(learnt.actor, batch.obs),
     )
     return offline(method, config, spec, 0.0, policy.probabilities)

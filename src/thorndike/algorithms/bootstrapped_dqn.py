@@ -35,6 +35,7 @@ from thorndike.networks.ensemble import Ensemble, value_ensemble
 from thorndike.networks.heads import Shape
 from thorndike.networks.network import NetworkBuilder
 from thorndike.networks.torso import ACTIVATIONS
+from thorndike.replay.age import key_to_look_by, mean_age
 from thorndike.replay.off_policy import repeated
 from thorndike.replay.pace import pace
 from thorndike.replay.uniform import ReplayBuffer, Transitions, add, init_replay, row_shapes, sample
@@ -172,6 +173,12 @@ def bootstrapped_dqn(config: Config, spec: EnvSpec, network: NetworkBuilder | No
         targets = jnp.where(due, follow(state.targets, held.params, config.tau), state.targets)
         return state._replace(held=held, targets=targets), metrics | {"train/learning_rate": rate}
 
+    def dynamics(state: State, rollout: PyTree) -> Metrics:
+        del rollout
+        key = key_to_look_by(state.env_steps)
+        batch = sample(state.replay, key, config.batch_size, spec.num_envs, config.n_step, config.gamma)
+        return ensemble.look(state.held, batch.obs) | {"train/replay_age": mean_age(state.replay, spec.num_envs)}
+
     return Algorithm(
         init=init,
         actor=lambda state: Actor(state.held.params, state.priors),
@@ -183,4 +190,5 @@ def bootstrapped_dqn(config: Config, spec: EnvSpec, network: NetworkBuilder | No
         update=update,
         observe=observe,
         needs=Needs(rollout_length=plan.rollout_length, on_policy=False, warmup_iterations=plan.warmup_iterations),
+        dynamics=dynamics,
     )

@@ -29,7 +29,7 @@ from thorndike.functional.offline_losses import conservative_gap
 from thorndike.functional.soft_policy import SoftPolicy, improve_policy, soft_policy, temperature
 from thorndike.functional.squashed_gaussian import sample_squashed, squashed_mode
 from thorndike.functional.temporal_difference import select
-from thorndike.networks.continuous import box_dimensions, critics, policy_outputs
+from thorndike.networks.continuous import box_dimensions, critics, look_into_actor_critic, policy_outputs
 from thorndike.networks.either_actions import action_values, number_of_actions
 from thorndike.networks.heads import Shape
 from thorndike.networks.network import NetworkBuilder
@@ -135,6 +135,7 @@ def conservative_q(config: Config, spec: EnvSpec) -> Method:
         value=lambda params, obs: jnp.max(pessimistic(params, obs), axis=-1),
         draw=lambda key, updates: jnp.zeros((updates, 0)),
         learn=learn,
+        look=lambda learnt, batch: net.look(learnt.critics, batch.obs, batch.action),
     )
 
 
@@ -199,4 +200,5 @@ def conservative_actor_critic(config: Config, spec: EnvSpec, network: NetworkBui
         value=lambda acting, obs: lowest(net.apply(acting.critics, obs, greedy(acting, obs)))[:, 0],
         draw=lambda key, updates: jax.random.normal(key, (updates, 2 + 2 * count, config.batch_size, dimensions)),
         learn=learn,
+        look=lambda learnt, batch: look_into_actor_critic(policy, learnt.policy.actor, net, learnt.critics, batch.obs, batch.action),
     )

@@ -32,6 +32,7 @@ from thorndike.functional.policy_losses import actor_critic_loss, approximate_kl
 from thorndike.functional.schedules import schedule
 from thorndike.functional.vtrace import vtrace
 from thorndike.networks.heads import Shape, policy_network
+from thorndike.networks.hidden_layers import look_into_rollout
 from thorndike.networks.network import Network, NetworkBuilder, apply_rollout, apply_step, flattened, fresh_memory
 from thorndike.networks.recurrent import MEMORIES
 from thorndike.networks.torso import ACTIVATIONS, example_observation
@@ -159,4 +160,5 @@ def impala(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None)
         update=update,
         observe=lambda state, rollout, key: (state, {}),
         needs=Needs(rollout_length=config.n_steps, on_policy=True),
+        dynamics=lambda state, rollout: look_into_rollout(flat_net, newest(state.history), rollout.obs, state.opt_state),
     )

@@ -21,11 +21,13 @@ from jaxtyping import Array, Float, Key
 
 from thorndike.functional.critic_losses import squared_errors
 from thorndike.functional.descent import Optimized, descend, follow, optimized
+from thorndike.functional.learning_dynamics import mean_square_gradient
 from thorndike.functional.offline_losses import advantage_weights, expectile_loss
 from thorndike.functional.policy_losses import weighted_mean
 from thorndike.networks.continuous import policy_outputs
 from thorndike.networks.either_actions import action_values, stochastic_policy
 from thorndike.networks.heads import Shape
+from thorndike.networks.hidden_layers import look_into
 from thorndike.networks.network import NetworkBuilder
 from thorndike.networks.torso import ACTIVATIONS
 from thorndike.replay.off_policy import Method
@@ -122,6 +124,10 @@ def iql(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) ->
         }
         return Learnt(actor, valued, judged, follow(learnt.target_params, judged.params, config.tau)), metrics
 
+    def look(learnt: Learnt, batch: Transitions) -> Metrics:
+        of_value = look_into(values, learnt.value.params, batch.obs, mean_square_gradient(learnt.value.opt_state), "value")
+        return policy.look(learnt.actor, batch.obs) | of_value | net.look(learnt.critics, batch.obs, batch.action)
+
     probabilities = policy.probabilities
     method = Method(
         name="iql",
@@ -133,6 +139,7 @@ def iql(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) ->
         value=lambda acting, obs: values.apply(acting.value, obs)[:, 0],
         draw=lambda key, updates: jnp.zeros((updates, 0)),
         learn=learn,
+        look=look,
     )
     told = None if probabilities is None else lambda acting, obs: probabilities(acting.actor, obs)
     return offline(method, config, spec, config.gamma, told)

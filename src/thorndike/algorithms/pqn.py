@@ -174,5 +174,5 @@ def pqn(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) ->
         update=update,
         observe=lambda state, rollout, key: (state, {}),
         needs=Needs(rollout_length=config.n_steps, on_policy=True),
-        dynamics=lambda state, obs: look_into_rollout(net, state.learnt.params, obs, state.learnt.opt_state),
+        dynamics=lambda state, rollout: look_into_rollout(net, state.learnt.params, rollout.obs, state.learnt.opt_state),
     )

@@ -154,5 +154,5 @@ def reinforce(config: Config, spec: EnvSpec, network: NetworkBuilder | None = No
         observe=lambda state, rollout, key: (state, {}),
         needs=Needs(rollout_length=config.n_steps, on_policy=True),
         probabilities=softmax_probabilities(net, spec.action_space),
-        dynamics=lambda state, obs: look_into_rollout(net, state.params, obs, state.opt_state),
+        dynamics=lambda state, rollout: look_into_rollout(net, state.params, rollout.obs, state.opt_state),
     )

@@ -34,6 +34,7 @@ from thorndike.functional.schedules import schedule
 from thorndike.functional.shuffling import minibatches
 from thorndike.functional.trust_region import backtracking_line_search, conjugate_gradient
 from thorndike.networks.heads import Shape, policy_network
+from thorndike.networks.hidden_layers import look_into_rollout
 from thorndike.networks.network import Network, NetworkBuilder, apply_rollout, apply_step, as_rows, begins_episode, flattened, fresh_memory
 from thorndike.networks.policy_parameters import reaches_policy
 from thorndike.networks.recurrent import MEMORIES
@@ -237,4 +238,5 @@ def trpo(config: Config, spec: EnvSpec, network: NetworkBuilder | None = None) -
         update=update,
         observe=lambda state, rollout, key: (state, {}),
         needs=Needs(rollout_length=config.n_steps, on_policy=True),
+        dynamics=lambda state, rollout: look_into_rollout(net, state.params, rollout.obs, state.opt_state),
     )

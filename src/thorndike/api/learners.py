@@ -11,9 +11,9 @@ from thorndike.api.building import EnvironmentLike
 from thorndike.api.loading import LoadedPolicy, load
 from thorndike.api.training import resume, train
 from thorndike.api.training_result import Result
+from thorndike.config_fields import read_config_fields
 from thorndike.errors import UserError
 from thorndike.networks.network import NetworkBuilder
-from thorndike.settings import read_config_fields
 from thorndike.suggestions import did_you_mean
 from thorndike.training.evaluation import Evaluation
 from thorndike.types import Wrapper

@@ -18,10 +18,10 @@ from thorndike.api.loading import load
 from thorndike.api.recorded_run import refuse_code
 from thorndike.api.sweep_trials import Numbered, TrialRunner, batches, check_trials, group_trials, trials_at_once
 from thorndike.api.training import as_json, resume, train
+from thorndike.config_fields import read_config_fields
 from thorndike.environments import registry, wrappers
 from thorndike.errors import UserError
 from thorndike.plotting.sweep import plot_sweep
-from thorndike.settings import read_config_fields
 from thorndike.statistics.sweeps import Effect, Factor, best_trial, effects_of, filled_scores
 from thorndike.training.evaluation import Evaluation
 from thorndike.training.json_files import Json, blamed_on

@@ -17,8 +17,8 @@ from thorndike.cli.train import (
     named_algorithm,
     names,
 )
+from thorndike.config_fields import read_config_fields
 from thorndike.learning_sources import check_source
-from thorndike.settings import read_config_fields
 
 EXAMPLES = """\
   thorndike bench ppo CartPole-v1

@@ -9,8 +9,9 @@ from thorndike.cli.answer import Answer
 from thorndike.cli.find_run import add_output_argument, all_runs, last_row, read_facts
 from thorndike.cli.parser import Parser
 from thorndike.cli.tables import mean, table
+from thorndike.config_fields import read_config_fields
 from thorndike.errors import UserError
-from thorndike.settings import describe_kind, read_config_fields
+from thorndike.settings import describe_kind
 from thorndike.suggestions import did_you_mean
 
 Row: TypeAlias = dict[str, object]

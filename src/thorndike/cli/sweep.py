@@ -13,10 +13,10 @@ from thorndike.cli.find_run import add_output_argument
 from thorndike.cli.parser import Parser, positive_whole
 from thorndike.cli.tables import table, text_of
 from thorndike.cli.train import add_training_arguments, check_output, check_preset, given_env_kwargs, given_settings, named_algorithm, names
+from thorndike.config_fields import read_config_fields
 from thorndike.errors import UserError
 from thorndike.learning_sources import check_source
 from thorndike.plotting.style import check_plot_file
-from thorndike.settings import read_config_fields
 from thorndike.training.sweep_directory import find_sweep, read_sweep
 from thorndike.training.sweep_ranges import SEARCHES, chosen_search, over_texts, swept_settings
 from thorndike.training.sweep_search import check_search

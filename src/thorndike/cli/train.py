@@ -15,10 +15,11 @@ from thorndike.cli.answer import Answer
 from thorndike.cli.environment_names import check_environment
 from thorndike.cli.find_run import add_output_argument, exists, find_run
 from thorndike.cli.parser import Parser, positive_whole, seed_number
+from thorndike.config_fields import read_config_fields
 from thorndike.environments.wrapper_names import parse_wrapper
 from thorndike.errors import UserError
 from thorndike.learning_sources import check_source, is_dataset
-from thorndike.settings import FieldFacts, parse_settings, read_config_fields
+from thorndike.settings import FieldFacts, parse_settings
 from thorndike.suggestions import did_you_mean
 
 if TYPE_CHECKING:

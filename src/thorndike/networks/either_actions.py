@@ -7,16 +7,19 @@ import gymnasium
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, Key, Shaped
+from jaxtyping import Array, Float, Key, PyTree, Shaped
 
 from thorndike.functional.action_distributions import categorical, diagonal_gaussian
+from thorndike.functional.descent import Optimized
+from thorndike.functional.learning_dynamics import mean_square_gradient
 from thorndike.functional.temporal_difference import select
 from thorndike.networks.continuous import box_dimensions, critics, policy_outputs
 from thorndike.networks.heads import Shape, q_network
+from thorndike.networks.hidden_layers import look_into, look_into_ensemble
 from thorndike.networks.masking import masked
-from thorndike.networks.network import NetworkBuilder, flattened
+from thorndike.networks.network import Network, NetworkBuilder, flattened
 from thorndike.networks.torso import example_observation
-from thorndike.types import EnvSpec, Observation
+from thorndike.types import EnvSpec, Metrics, Observation
 
 LOG_STD_MIN, LOG_STD_MAX = -5.0, 2.0
 
@@ -35,6 +38,8 @@ class StochasticPolicy(NamedTuple):
     mode: Callable[[Float[Array, " P"], Observation], Shaped[Array, "..."]]
     probabilities: Callable[[Float[Array, " P"], Observation], Float[Array, "M A"]] | None
     """Of Discrete actions; None of a Box."""
+    look: Callable[[Optimized, Observation], Metrics]
+    """what is learnt, obs -> dead units, effective rank, gradient norms."""
 
 
 class ActionValues(NamedTuple):
@@ -46,6 +51,8 @@ class ActionValues(NamedTuple):
     """parameters, obs, action -> its value according to each critic."""
     every: Callable[[Float[Array, "K P"], Observation], Float[Array, "K M A"]] | None
     """parameters, obs -> values of all Discrete actions, those forbidden very low; None of a Box."""
+    look: Callable[[Optimized, Observation, Shaped[Array, "..."]], Metrics]
+    """what is learnt, obs, action -> dead units, effective rank, gradient norms: the mean over the critics."""
 
 
 def number_of_actions(spec: EnvSpec) -> int | None:
@@ -75,6 +82,7 @@ def stochastic_policy(name: str, spec: EnvSpec, shape: Shape, given: NetworkBuil
         sample=sample,
         mode=lambda params, obs: family.mode(logits(params, obs)),
         probabilities=lambda params, obs: jax.nn.softmax(logits(params, obs)),
+        look=_look_into_policy(network),
     )
 
 
@@ -83,7 +91,7 @@ def action_values(name: str, spec: EnvSpec, number: int, shape: Shape) -> Action
     count = number_of_actions(spec)
     if count is None:
         ensemble = critics(spec, box_dimensions(name, spec), number, shape.net_arch, shape.activation, layer_norm=shape.layer_norm)
-        return ActionValues(ensemble.init, lambda params, obs, action: ensemble.apply(params, obs, action)[..., 0], None)
+        return ActionValues(ensemble.init, lambda params, obs, action: ensemble.apply(params, obs, action)[..., 0], None, ensemble.look)
     plain, example = q_network(spec, count, shape, dueling=False), example_observation(spec.observation_space)
     flat = flattened(plain, example)
 
@@ -97,7 +105,19 @@ def action_values(name: str, spec: EnvSpec, number: int, shape: Shape) -> Action
         values = every(params, obs)
         return select(values, jnp.broadcast_to(action, values.shape[:2]))
 
-    return ActionValues(init, taken, every)
+    def look(learnt: Optimized, obs: Observation, action: Shaped[Array, "..."]) -> Metrics:
+        del action
+
+        def layers(one: Float[Array, " P"]) -> PyTree:
+            return {} if flat.layers is None else flat.layers(one, obs)
+
+        return look_into_ensemble("critics", layers, flat.modules, learnt.params, mean_square_gradient(learnt.opt_state))
+
+    return ActionValues(init, taken, every, look)
+
+
+def _look_into_policy(network: Network) -> Callable[[Optimized, Observation], Metrics]:
+    return lambda learnt, obs: look_into(network, learnt.params, obs, mean_square_gradient(learnt.opt_state), "actor")
 
 
 def _gaussian(name: str, spec: EnvSpec, shape: Shape, given: NetworkBuilder | None) -> StochasticPolicy:
@@ -116,4 +136,5 @@ def _gaussian(name: str, spec: EnvSpec, shape: Shape, given: NetworkBuilder | No
         sample=lambda params, obs, noise: jnp.clip(family.sample(parameters(params, obs), noise), -1.0, 1.0),
         mode=lambda params, obs: family.mode(parameters(params, obs)),
         probabilities=None,
+        look=_look_into_policy(network),
     )

@@ -6,14 +6,17 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Float, Key, PyTree
 
 from thorndike.errors import UserError
+from thorndike.functional.descent import Optimized
+from thorndike.functional.learning_dynamics import mean_square_gradient
 from thorndike.networks.heads import Shape, q_outputs
+from thorndike.networks.hidden_layers import look_into_ensemble
 from thorndike.networks.masking import check_mask, has_mask, hide_forbidden
 from thorndike.networks.network import NetworkBuilder, flattened
 from thorndike.networks.torso import example_observation
-from thorndike.types import EnvSpec, Number, Observation
+from thorndike.types import EnvSpec, Metrics, Number, Observation
 
 
 class Ensemble(NamedTuple):
@@ -23,6 +26,8 @@ class Ensemble(NamedTuple):
     """key -> parameters, of the networks or of their priors. Consumes the key."""
     values: Callable[[Float[Array, "K P"], Float[Array, "K P"], Observation], Float[Array, "K B A"]]
     """parameters, priors, obs ``[B, ...]`` -> Q-values of every member, those of forbidden actions very low."""
+    look: Callable[[Optimized, Observation], Metrics]
+    """what is learnt ``[K, P]``, obs -> dead units, effective rank, gradient norms, without the priors: the mean over the members."""
 
 
 def value_ensemble(
@@ -49,4 +54,10 @@ def value_ensemble(
 
         return jax.vmap(member)(params, priors)
 
-    return Ensemble(init, values)
+    def look(learnt: Optimized, obs: Observation) -> Metrics:
+        def layers(flat: Float[Array, " P"]) -> PyTree:
+            return {} if network.layers is None else network.layers(flat, obs)
+
+        return look_into_ensemble("members", layers, network.modules, learnt.params, mean_square_gradient(learnt.opt_state))
+
+    return Ensemble(init, values, look)

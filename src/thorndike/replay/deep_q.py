@@ -179,13 +179,6 @@ def deep_q(name: str, config: Settings, options: Options, spec: EnvSpec, network
     def actor(state: State) -> Actor:
         return Actor(state.params, exploration(state.env_steps / config.total_steps))
 
-    def draw(key: Key[Array, ""], steps: int) -> Noise:
-        if not net.noise_size:
-            return Noise(jax.random.uniform(key, (steps, spec.num_envs)), ())
-        key_choice, key_layers = jax.random.split(key)
-        layers = Shared(jax.random.normal(key_layers, (steps, net.noise_size)))
-        return Noise(jax.random.uniform(key_choice, (steps, spec.num_envs)), layers)
-
     def act(actor: Actor, memory: PyTree, obs: Observation, noise: Noise) -> tuple[PyTree, Int[Array, " B"], PyTree]:
         layers = noise.layers.numbers if isinstance(noise.layers, Shared) else jnp.zeros(0)
         later, outputs = apply_step(net.network, net.drawn(actor.params, layers), memory, obs)
@@ -222,18 +215,11 @@ def deep_q(name: str, config: Settings, options: Options, spec: EnvSpec, network
             state = begin_anew(parts, state, due, keys[-1])
         return state, metrics | explored | {"train/learning_rate": rate}
 
-    def dynamics(state: State, obs: Observation) -> Metrics:
-        del obs
-        seen = replayed_observations(parts.replay, state.replay, key_to_look_by(state.env_steps), config.batch_size)
-        squares = net.means(mean_square_gradient(state.opt_state))
-        networks = look_into(net.network, net.means(state.params), seen, squares)
-        return networks if parts.replay.age is None else networks | {"train/replay_age": parts.replay.age(state.replay)}
-
     return Algorithm(
         init=partial(begin, parts),
         actor=actor,
         memory=lambda batch: fresh_memory(net.network, batch),
-        draw=draw,
+        draw=lambda key, steps: draw_noise(key, steps, spec.num_envs, net.noise_size),
         act=act,
         greedy=greedy,
         value=lambda actor, obs: jnp.max(net.q(net.network.apply(net.means(actor.params), obs), obs), axis=-1),
@@ -242,8 +228,24 @@ def deep_q(name: str, config: Settings, options: Options, spec: EnvSpec, network
         needs=Needs(rollout_length=plan.rollout_length, on_policy=False, warmup_iterations=plan.warmup_iterations),
         # Noisy layers act by a draw of their weights: nobody can say how often which action comes first.
         probabilities=probabilities if not net.noise_size and options.temperature is None else None,
-        dynamics=dynamics,
+        dynamics=lambda state, rollout: look_into_replayed(parts, state, config.batch_size),
     )
+
+
+def draw_noise(key: Key[Array, ""], steps: int, num_envs: int, noise_size: int) -> Noise:
+    """The random numbers of ``steps`` steps, ``noise_size`` of each for noisy layers. Consumes the key."""
+    if not noise_size:
+        return Noise(jax.random.uniform(key, (steps, num_envs)), ())
+    key_choice, key_layers = jax.random.split(key)
+    layers = Shared(jax.random.normal(key_layers, (steps, noise_size)))
+    return Noise(jax.random.uniform(key_choice, (steps, num_envs)), layers)
+
+
+def look_into_replayed(parts: Parts, state: State, batch_size: int) -> Metrics:
+    """Dead units, effective rank and gradient norms, from observations of the replay, and how old what is replayed is."""
+    net, seen = parts.net, replayed_observations(parts.replay, state.replay, key_to_look_by(state.env_steps), batch_size)
+    networks = look_into(net.network, net.means(state.params), seen, net.means(mean_square_gradient(state.opt_state)))
+    return networks if parts.replay.age is None else networks | {"train/replay_age": parts.replay.age(state.replay)}
 
 
 def plan_of(name: str, config: Settings, options: Options, num_envs: int) -> Pace:

@@ -189,8 +189,8 @@ def off_policy(method: Method, config: Settings, spec: EnvSpec) -> Algorithm:
         metrics |= saturation(spec.action_space, rollout.action)
         return State(learnt, updates, replay, state.env_steps + per_iteration), metrics
 
-    def dynamics(state: State, obs: Observation) -> Metrics:
-        del obs
+    def dynamics(state: State, rollout: PyTree) -> Metrics:
+        del rollout
         batch = memory.sample(state.replay, key_to_look_by(state.env_steps), jnp.ones(())).batch
         networks = {} if method.look is None else method.look(state.learnt, batch)
         return networks if memory.age is None else networks | {"train/replay_age": memory.age(state.replay)}

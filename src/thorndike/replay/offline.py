@@ -87,6 +87,10 @@ def offline(
         learnt, metrics = repeated(one, state.learnt, count, state.updates >= 0)
         return State(learnt, state.updates + count), metrics | {"train/learning_rate": rate}
 
+    def dynamics(state: State, rollout: Rollout) -> Metrics:
+        first = jax.tree.map(lambda x: x[0], minibatches_of(rollout, gamma))
+        return {} if method.look is None else method.look(state.learnt, first)
+
     return Algorithm(
         init=init,
         actor=lambda state: Actor(method.acting(state.learnt), jnp.zeros((), jnp.bool_)),
@@ -99,4 +103,5 @@ def offline(
         observe=lambda state, rollout, key: (state, {}),
         needs=Needs(rollout_length=UPDATES_OF_AN_ITERATION, on_policy=False, batch_size=config.batch_size),
         probabilities=None if probabilities is None else lambda actor, memory, obs: probabilities(actor.learnt, obs),
+        dynamics=None if method.look is None else dynamics,
     )

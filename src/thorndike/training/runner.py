@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int, Key, PyTree, UInt32
 from thorndike.training.devices import over_devices, placed
 from thorndike.training.host_source import HostSource
 from thorndike.training.time_shares import Clock, SegmentTimes, Shares
-from thorndike.types import Algorithm, EpisodeStats, Metrics, Observation, Rollout, Source
+from thorndike.types import Algorithm, EpisodeStats, Metrics, Rollout, Source
 
 _ROWS_OF_A_PAGE = 1_024
 RUN_ONCE = {"xla_backend_optimization_level": 0}
@@ -207,22 +207,23 @@ def _inspector(algorithm: Algorithm, source: Source, devices: int) -> Callable[[
 def _dynamics(algorithm: Algorithm, source: Source, latest: Latest, spent: Stopwatch, devices: int) -> Callable[[Carry, int], Metrics]:
     """One small program, compiled when it is first asked for.
 
-    On-policy learners are shown the rollout that they learn from next or, of a host engine, which cannot make it twice, the last one.
+    Learners without a replay are shown the rollout they learn from next or, of a host engine, which cannot make it twice, the last one.
     """
-    again, look = _collected_again(algorithm, source), cast(Callable[[PyTree, Observation], Metrics], algorithm.dynamics)
-    collects = source.compiled and algorithm.needs.on_policy
+    again, look = _collected_again(algorithm, source), cast(Callable[[PyTree, PyTree], Metrics], algorithm.dynamics)
+    shown = algorithm.needs.on_policy or source.spec.engine == "dataset"
+    collects = source.compiled and shown
 
-    def one(carry: Carry, obs: Observation, iteration: Int[Array, ""]) -> Metrics:
-        return look(carry.learner, again(carry, iteration).obs if collects else obs)
+    def one(carry: Carry, rollout: PyTree, iteration: Int[Array, ""]) -> Metrics:
+        return look(carry.learner, again(carry, iteration) if collects else rollout)
 
-    def all_seeds(carry: Carry, obs: Observation, iteration: Int[Array, ""]) -> Metrics:
-        return over_seeds(lambda carry, obs: one(carry, obs, iteration))(carry, obs)
+    def all_seeds(carry: Carry, rollout: PyTree, iteration: Int[Array, ""]) -> Metrics:
+        return over_seeds(lambda carry, rollout: one(carry, rollout, iteration))(carry, rollout)
 
     traced = jax.jit(over_devices(all_seeds, devices))
     programs: list[Callable] = []
 
     def run(carry: Carry, iteration: int) -> Metrics:
-        seen = latest.rollout.obs if algorithm.needs.on_policy and not source.compiled else ()
+        seen = latest.rollout if shown and not source.compiled else ()
         arguments = placed(carry, devices) if source.compiled else carry._replace(source=()), seen, np.int32(iteration)
         if not programs:
             spent.start()
