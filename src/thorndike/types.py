@@ -1,7 +1,6 @@
-"""The whole vocabulary: what environments, learners and the runner say to each other.
+"""The whole vocabulary: what environments, learners and the runner say to each other, as tuples of arrays or of pure functions.
 
-Shapes are written ``[T, B, ...]``: time first, then the batch of environments. ``S`` is the number of seeds. Everything here is a
-``NamedTuple`` of arrays or of pure functions, so that it can be scanned, vmapped and compiled.
+Shapes are written ``[T, B, ...]``: time first, then the batch of environments. ``S`` is the number of seeds.
 """
 
 from collections.abc import Callable
@@ -11,8 +10,7 @@ import gymnasium
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
 Observation: TypeAlias = PyTree
-"""An array ``[B, ...]``, or a dict/tuple of them where the space is a Dict or Tuple. Its entry ``action_mask``, if it has one, says which
-actions are allowed: masks come in with the observation."""
+"""An array ``[B, ...]``, or a dict/tuple of them. Its entry ``action_mask``, if it has one, says which actions are allowed."""
 
 Action: TypeAlias = PyTree
 """``int32[B]`` (Discrete), ``int32[B, K]`` (MultiDiscrete, MultiBinary) or ``float32[B, D]`` (Box)."""
@@ -30,9 +28,6 @@ class Shared(NamedTuple):
 Metrics: TypeAlias = dict[str, Array]
 """Scalars by Stable-Baselines3's metric names, for example ``train/approx_kl``."""
 
-Schedule: TypeAlias = Callable[[Array], Array]
-"""Progress in ``[0, 1]`` to a value: how a rate changes over a run."""
-
 Number: TypeAlias = float | Float[Array, ""]
 """A setting that is a plain number, or traced where the agents of one compiled program differ in it (a sweep)."""
 
@@ -40,8 +35,7 @@ Number: TypeAlias = float | Float[Array, ""]
 class Step(NamedTuple):
     """One step of a batch of environments.
 
-    ``terminated`` (the task ended: the future is worth 0) and ``truncated`` (a limit cut it: the future goes on at ``next_obs``) stay
-    apart until a function in ``functional/`` needs them together.
+    ``terminated`` (the task ended: the future is worth 0) and ``truncated`` (a limit cut it: it goes on at ``next_obs``) stay apart.
     """
 
     obs: Observation
@@ -109,20 +103,18 @@ class EnvSpec(NamedTuple):
     goal: Goal | None = None
     """For hindsight; None where there are no goals, or where no compiled program can judge them."""
     frames: int = 1
-    """How many successive frames an observation holds on its last axis, the newest last: what replay then stores once."""
+    """How many successive frames an observation holds on its last axis, the newest last: replay stores each once."""
 
 
 class Environment(NamedTuple):
     """A batch of environments as pure functions (the compiled engines).
 
-    ``step`` resets finished environments by itself and reports the true successor in ``Step.next_obs``. Randomness reaches ``step`` as
-    *noise*, drawn for many steps at once by ``draw``: one batched draw outside the scan costs less than half of one inside it.
+    ``step`` resets finished environments by itself. Its randomness is *noise*, drawn for many steps outside of the scan, which is cheap.
     """
 
     init: Callable[[Key[Array, ""]], tuple[PyTree, Observation]]
     """key -> state, first observation ``[B, ...]``. Consumes the key."""
     step: Callable[[PyTree, Action, Noise], tuple[PyTree, Step]]
-    """state, action ``[B, ...]``, noise of this step -> state, Step."""
     draw: Callable[[Key[Array, ""], int], Noise]
     """key, number of steps T -> noise with leading axis ``[T, ...]``. Consumes the key."""
     spec: EnvSpec
@@ -164,27 +156,19 @@ class Algorithm(NamedTuple):
     needs: Needs
     probabilities: Callable[[PyTree, PyTree, Observation], Float[Array, "*batch actions"]] | None = None
     """Actor, memory, obs -> the probability of each Discrete action under ``act``; None where it is not known."""
-
     dynamics: Callable[[PyTree, PyTree], Metrics] | None = None
-    """State, the latest rollout (``()`` for learners with a replay, who look into that) -> what is logged at a few log points only: dead
-    units, gradient norms by module, ... It changes nothing."""
-
-
-def _as_they_are(statistics: PyTree, key: Key[Array, ""]) -> PyTree:
-    del key
-    return statistics
+    """State, the latest rollout (``()`` if there is a replay to look into) -> what is logged at a few log points only: dead units, ..."""
 
 
 class Wrapper(NamedTuple):
     """A change to what the learner sees, as pure functions over a stream of steps: it works on every engine.
 
-    ``memory`` is per environment and starts afresh in evaluation (stacked frames); ``statistics`` is shared, learnt in training, frozen in
-    evaluation and exported with the policy (running mean and variance).
+    ``memory`` is per environment (stacked frames); ``statistics`` (running mean) are shared, frozen in evaluation, exported.
     """
 
     name: str
     settings: dict
-    """What ``run.json`` and ``policy.json`` record so that the wrapper can be rebuilt; empty if it holds a function of the user's."""
+    """What ``run.json`` records so that the wrapper can be rebuilt; empty if it holds a function of the user's."""
     spec: Callable[[EnvSpec], EnvSpec]
     statistics: Callable[[EnvSpec], PyTree]
     """wrapped spec -> initial statistics, ``()`` if none."""
@@ -194,7 +178,7 @@ class Wrapper(NamedTuple):
     """statistics, memory, the unwrapped obs acted on, action, Step -> memory, Step as the learner sees it."""
     learn: Callable[[PyTree, PyTree, Rollout], tuple[PyTree, PyTree, Rollout]]
     """statistics, memory, rollout as ``step`` made it -> statistics, memory, rollout: once a rollout, all ``[T, B]`` rows at once."""
-    randomize: Callable[[PyTree, Key[Array, ""]], PyTree] = _as_they_are
+    randomize: Callable[[PyTree, Key[Array, ""]], PyTree] = lambda statistics, key: statistics
     """initial statistics, key -> those that a seed begins with, where some of them are random. Consumes the key."""
 
 

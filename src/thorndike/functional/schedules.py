@@ -1,13 +1,17 @@
 """Rates that change over a run, written as a number or as text: ``3e-4``, ``"linear(3e-4, 0)"``, ``"linear(1.0, 0.05, 0.1)"``."""
 
 import re
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple, TypeAlias
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from thorndike.errors import UserError
-from thorndike.types import Number, Schedule
+from thorndike.types import Number
+
+Schedule: TypeAlias = Callable[[Array], Array]
+"""Progress in ``[0, 1]`` to a value: how a rate changes over a run."""
 
 _TEXT = re.compile(r"(?P<kind>linear|cosine|exponential)\((?P<numbers>[^()]*)\)")
 
