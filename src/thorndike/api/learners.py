@@ -50,7 +50,7 @@ class Learner:
         start_from: str | Path | None = None,
         **settings: object,
     ) -> None:
-        """``settings`` are fields of the algorithm's ``Config``, the rest is as in ``td.train``. Raises ``UserError`` for an unknown one."""
+        """``settings`` are fields of the algorithm's ``Config``, the rest is as in ``td.train``. Raises ``UserError`` for unknown ones."""
         known = read_config_fields(self.algorithm)
         for name in settings:
             if name not in known:
