@@ -105,6 +105,17 @@ def test_a_learner_from_data_is_a_run_like_any_other(made, tmp_path):
     assert first == second
 
 
+def test_a_learner_of_a_dataset_is_an_object_like_any_other(made, tmp_path):
+    """Of its folder or of what was read: it learns, learns further, is evaluated on the dataset's environment, and acts."""
+    learner = td.IQL(made.data, output=tmp_path, **SMALL).learn(20)
+    assert learner.learn(20).result.steps == 40
+    assert learner.evaluate(2).environment == "CartPole-v1"
+    assert learner.predict(made.data.obs[0])[0] in (0, 1)
+    assert td.BC(made.data.path, output=tmp_path, **SMALL).learn(20).result.status == "finished"
+    with pytest.raises(UserError, match="is a dataset; those that learn from one"):
+        td.PPO(made.data, output=tmp_path).learn(20)
+
+
 def test_a_dataset_that_was_changed_is_not_gone_on_with(made, tmp_path):
     copy = td.mix(made.data.path, made.data.path, to=tmp_path / "mine" / "copy-v0")
     run = td.train("bc", str(copy.path), steps=20, settings=SMALL, output=tmp_path / "runs").run

@@ -13,20 +13,25 @@ from thorndike.api.training import resume, train
 from thorndike.api.training_result import Result
 from thorndike.config_fields import read_config_fields
 from thorndike.errors import UserError
+from thorndike.learning_sources import is_dataset
 from thorndike.networks.network import NetworkBuilder
 from thorndike.suggestions import did_you_mean
+from thorndike.training.datasets import Dataset
 from thorndike.training.evaluation import Evaluation
 from thorndike.types import Wrapper
 
 
 class Learner:
-    """An algorithm on an environment. Every ``learn`` makes or continues a run directory, ``learner.result.run``."""
+    """An algorithm on an environment or, of those that learn from data, on a dataset or its folder.
+
+    Every ``learn`` makes or continues a run directory, ``learner.result.run``.
+    """
 
     algorithm: str
 
     def __init__(
         self,
-        environment: EnvironmentLike,
+        environment: EnvironmentLike | Dataset | Path,
         *,
         num_envs: int | None = None,
         seeds: int = 1,
@@ -42,18 +47,23 @@ class Learner:
         actor_threads: int = 0,
         actor_schedule: str = "fixed",
         env_restarts: int = 0,
+        start_from: str | Path | None = None,
         **settings: object,
     ) -> None:
-        """``settings`` are the fields of the algorithm's ``Config``. Raises ``UserError`` at once for one that it does not have."""
+        """``settings`` are fields of the algorithm's ``Config``, the rest is as in ``td.train``. Raises ``UserError`` for unknown ones."""
         known = read_config_fields(self.algorithm)
         for name in settings:
             if name not in known:
                 raise UserError(f"{self.algorithm} has no setting '{name}'{did_you_mean(name, known)}")
-        self._environment, self._wrappers, self._network = environment, wrappers, network
+        place = environment.path if isinstance(environment, Dataset) else environment
+        learns_from = str(place) if isinstance(place, Path) else place
+        # What to evaluate on; a dataset's run knows the environment by itself.
+        self._environment = None if is_dataset(learns_from) else learns_from
+        self._wrappers, self._network = wrappers, network
         self._train = partial(
             train,
             self.algorithm,
-            environment,
+            learns_from,
             num_envs=num_envs,
             seeds=seeds,
             seed=seed,
@@ -69,12 +79,13 @@ class Learner:
             actor_threads=actor_threads,
             actor_schedule=actor_schedule,
             env_restarts=env_restarts,
+            start_from=start_from,
         )
         self.result: Result | None = None
         self._policy: LoadedPolicy | None = None
 
     def learn(self, steps: int | None = None, progress: bool = False) -> "Learner":
-        """Train for ``steps`` environment steps of each seed; a second call trains that much further."""
+        """Train for ``steps`` environment steps of each seed, or updates on a dataset; a second call trains that much further."""
         if self.result is None:
             self.result = self._train(steps=steps, progress=progress)
         else:
@@ -215,6 +226,36 @@ class REDQ(Learner):
     """Randomised ensembled double Q-learning."""
 
     algorithm = "redq"
+
+
+class BC(Learner):
+    """Behaviour cloning of a dataset."""
+
+    algorithm = "bc"
+
+
+class CQL(Learner):
+    """Conservative Q-learning from a dataset."""
+
+    algorithm = "cql"
+
+
+class IQL(Learner):
+    """Implicit Q-learning from a dataset."""
+
+    algorithm = "iql"
+
+
+class TD3BC(Learner):
+    """TD3 from a dataset, kept near its actions."""
+
+    algorithm = "td3_bc"
+
+
+class AWAC(Learner):
+    """Advantage-weighted actor-critic, from a dataset or an environment."""
+
+    algorithm = "awac"
 
 
 class QLearning(Learner):
