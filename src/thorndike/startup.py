@@ -51,16 +51,13 @@ def without_device_count(flags: str) -> str:
 
 
 def device_count(at_most: int | None) -> int:
-    """How many devices there are to train on, at most ``at_most``. Raises ``UserError`` if so many were asked for and there are fewer."""
+    """How many devices there are to train on, at most ``at_most``. Raises ``UserError`` if that is less than one."""
     import jax
 
+    if at_most is not None and at_most < 1:
+        raise UserError(f"devices={at_most}: training needs one at least; leave it out to use all there are")
     found = jax.device_count()
-    if at_most is not None and not 1 <= at_most <= found:
-        raise UserError(
-            f"--devices {at_most}: JAX has {found} here; ask for 1 to {found}"
-            + (" (the number is fixed once JAX has started)" if 1 <= at_most <= cores() else "")
-        )
-    return found if at_most is None else at_most
+    return found if at_most is None else min(at_most, found)
 
 
 def choose_device(device: str, large: bool, processors: int | None = None) -> str:
@@ -79,5 +76,6 @@ def choose_device(device: str, large: bool, processors: int | None = None) -> st
         jax.config.update("jax_platforms", wanted)
     try:
         return jax.default_backend()
-    except RuntimeError as error:
+    except (RuntimeError, AssertionError) as error:
+        # The second where this build of JAX does not know the platform at all.
         raise UserError(f"--device {device}: JAX has no such device here ({str(error).splitlines()[0]}); use --device cpu") from error

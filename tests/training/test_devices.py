@@ -35,9 +35,10 @@ def test_a_seed_has_the_same_bits_on_one_device_and_on_two(tmp_path):
     assert [digest(path) for path in one] == [digest(path) for path in two]
 
 
-def test_more_devices_than_there_are_is_a_plain_mistake():
-    with pytest.raises(UserError, match="--devices 100: JAX has 1 here; ask for 1 to 1"):
-        device_count(100)
+def test_as_many_devices_are_used_as_there_are_and_were_asked_for():
+    assert device_count(100) == device_count(None) >= device_count(1) == 1
+    with pytest.raises(UserError, match="devices=0: training needs one at least"):
+        device_count(0)
 
 
 def test_the_number_of_devices_is_no_difference_between_machines():

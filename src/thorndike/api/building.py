@@ -189,7 +189,7 @@ def full_request(
     steps = steps or preset.steps or DEFAULT_STEPS
     return Request(
         algorithm=algorithm,
-        environment=choice.id,
+        environment=lasting_name(choice.id),
         env_kwargs=dict(choice.env_kwargs),
         max_episode_steps=choice.max_episode_steps,
         engine=choice.engine if data is None else ENGINE,
@@ -227,6 +227,12 @@ def check_actors(algorithm: str, choice: registry.Choice, actors: ActorThreads) 
         )
     if isinstance(choice.origin, gymnasium.vector.VectorEnv):
         raise UserError(f"{choice.id} is one vector, and each actor thread needs its own: give the id or class of its environment")
+
+
+def lasting_name(environment: str) -> str:
+    """A class in a file by the file's absolute path, so that its run finds it from every folder; other names as they are."""
+    file, _, name = environment.rpartition(":")
+    return f"{Path(file).absolute()}:{name}" if file.endswith(".py") and Path(file).is_file() else environment
 
 
 def build_job(

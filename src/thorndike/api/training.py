@@ -44,6 +44,9 @@ from thorndike.types import Wrapper
 SHAPES = ("net_arch", "activation")
 """The settings that the sizes of networks follow from."""
 
+_MOST = 1_000_000
+"""Seeds, or environments of a seed: more is a slip of the keyboard, and its arrays fit nowhere."""
+
 
 def train(
     algorithm: str,
@@ -87,21 +90,20 @@ def train(
     be made anew after a fault. Raises ``UserError`` for anything that cannot be.
     """
     check_algorithm(algorithm)
-    if not 0 <= seed < 2**32 or seeds < 1:
-        raise UserError(f"a seed is a number from 0 to 2^32 - 1, and there is at least one; got seed={seed}, seeds={seeds}")
+    _check_numbers(seed, seeds, num_envs)
     check_source(algorithm, environment)
+    of_stepping: dict[str, object] = {"num_envs": num_envs, "wrappers": wrappers, "start_from": start_from, "devices": devices}
+    of_stepping |= {"actor_threads": actor_threads, "env_restarts": env_restarts}
     data = read_dataset(str(environment)) if is_dataset(environment) else None
     if data is not None:
-        refuse_stepping(num_envs, engine, wrappers, env_kwargs, max_episode_steps, start_from)
+        of_stepping |= {"env_kwargs": env_kwargs, "max_episode_steps": max_episode_steps, "engine": None if engine == "auto" else engine}
+        refuse_given(of_stepping, "a dataset is as it was recorded, and no environment is stepped")
         environment, env_kwargs, max_episode_steps = data.origin[:3]
     choice, found = choose(algorithm, environment, preset, engine, env_kwargs, max_episode_steps)
     if algorithm == "planning":
+        refuse_given(of_stepping | {"seeds": seeds > 1, "network": network}, "planning computes the exact values of one table")
         return plan_run(choice, settings or {}, output, name, command)
-    settings, started = dict(settings or {}), None
-    if start_from is not None:
-        # Networks of the same size, unless they are asked for; what acts knows already how, so that nothing is drawn at random first.
-        before, started = offline_request(Path(start_from), algorithm, choice.id), str(Path(start_from).absolute())
-        settings = {name: before.config[name] for name in SHAPES} | {"learning_starts": 0} | settings
+    settings, started = _begun(start_from, algorithm, choice.id, dict(settings or {}))
     actors = ActorThreads(actor_threads, actor_schedule, env_restarts)
     request = full_request(
         algorithm, choice, found, wrappers, settings, steps, num_envs, seeds, seed, checkpoint_every, actors, data, started
@@ -156,26 +158,34 @@ def runs(output: str | Path = "runs") -> list[Path]:
     return sorted((path.parent for path in Path(output).glob("*/*/*/run.json")), key=lambda path: path.name)
 
 
-def refuse_stepping(
-    num_envs: int | None,
-    engine: str,
-    wrappers: Sequence[Wrapper] | None,
-    env_kwargs: Mapping[str, object] | None,
-    max_episode_steps: int | None,
-    start_from: str | Path | None,
-) -> None:
-    """Raises ``UserError`` for what has no meaning where no environment is stepped, rather than leave it out."""
-    given: dict[str, object] = {"num_envs": num_envs, "wrappers": wrappers, "env_kwargs": env_kwargs, "start_from": start_from}
-    given |= {"max_episode_steps": max_episode_steps, "engine": engine if engine != "auto" else None}
-    for name, value in given.items():
+def _check_numbers(seed: int, seeds: int, num_envs: int | None) -> None:
+    if max(seeds, num_envs or 1) > _MOST:
+        raise UserError(f"at most {_MOST:,} seeds and environments each; got seeds={seeds}, num_envs={num_envs}")
+    if not 0 <= seed < 2**32 or seeds < 1:
+        raise UserError(f"a seed is a number from 0 to 2^32 - 1, and there is at least one; got seed={seed}, seeds={seeds}")
+
+
+def _begun(start_from: str | Path | None, algorithm: str, environment: str, settings: Json) -> tuple[Json, str | None]:
+    """Settings, and the run that training goes on from, if it does."""
+    if start_from is None:
+        return settings, None
+    # Networks of the same size, unless they are asked for; what acts knows already how, so that nothing is drawn at random first.
+    before = offline_request(Path(start_from), algorithm, environment)
+    return {name: before.config[name] for name in SHAPES} | {"learning_starts": 0} | settings, str(Path(start_from).absolute())
+
+
+def refuse_given(arguments: Mapping[str, object], why: str) -> None:
+    """Raises ``UserError`` for an argument that has no meaning here, rather than leave it out."""
+    for name, value in arguments.items():
         if value:
-            raise UserError(f"a dataset is as it was recorded, and no environment is stepped: leave {name} out")
+            raise UserError(f"{why}: leave {name} out")
 
 
 def _conduct(run: Path, record: Json, job: Job, progress: bool, begin: Callable[[], Start]) -> Result:
     """Run the session; whatever happens, ``run.json`` says how it ended."""
     spent = Stopwatch()
     spent.start()
+    compiled_before = job.runner.compile_seconds(), job.runner.compile_wall_seconds()
     per_iteration = job.runner.steps_per_iteration
     keeping = Keeping(
         save=lambda carry, progressed: save_checkpoint(run, carry, job.source, progressed, per_iteration, as_json(job.request)),
@@ -193,7 +203,7 @@ def _conduct(run: Path, record: Json, job: Job, progress: bool, begin: Callable[
         status = "interrupted" if isinstance(error, KeyboardInterrupt | SystemExit) else "failed"
         _note(run, {**record, "status": status, "error": f"{type(error).__name__}: {error}"})
         raise
-    result = _result(run, job, start, outcome)
+    result = _result(run, job, start, outcome, *compiled_before)
     times = {"wall_s": outcome.wall_s, "cpu_s": outcome.cpu_s, "compile_s": result.compile_s, "steps_done": outcome.steps}
     _note(run, {**record, "status": outcome.status, **times})
     return result
@@ -235,8 +245,9 @@ def _restored(run: Path, job: Job) -> Start:
     return Start(carry, progressed, last_points(run, RECENT, job.request.seeds))
 
 
-def _result(run: Path, job: Job, start: Start, outcome: Outcome) -> Result:
-    compile_s = job.runner.compile_seconds()
+def _result(run: Path, job: Job, start: Start, outcome: Outcome, compiled_s: float, compiled_wall_s: float) -> Result:
+    """What a session did; what had been compiled ahead of it, to restore a checkpoint, is not in its times."""
+    compile_s, compile_wall_s = job.runner.compile_seconds() - compiled_s, job.runner.compile_wall_seconds() - compiled_wall_s
     before = start.progressed
     made = (outcome.steps - before.iteration * job.runner.steps_per_iteration) * job.request.seeds
     wall, cpu = outcome.wall_s - before.wall_s, outcome.cpu_s - before.cpu_s
@@ -249,7 +260,7 @@ def _result(run: Path, job: Job, start: Start, outcome: Outcome) -> Result:
         wall_s=outcome.wall_s,
         cpu_s=outcome.cpu_s,
         compile_s=compile_s,
-        steps_per_s=made / max(wall - job.runner.compile_wall_seconds(), 1e-9),
+        steps_per_s=made / max(wall - compile_wall_s, 1e-9),
         steps_per_cpu_s=made / max(cpu - compile_s, 1e-9),
         mean_return=sum(returns) / len(returns) if returns else math.nan,
         saved_steps=outcome.saved_steps,

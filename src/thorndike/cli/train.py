@@ -92,11 +92,14 @@ def run(words: Sequence[str]) -> Answer:
     return trained(result)
 
 
-def add_training_arguments(parser: Parser, fields: Mapping[str, FieldFacts]) -> None:
-    """The arguments that say what is trained; `train` and `bench` share them."""
+def add_training_arguments(parser: Parser, fields: Mapping[str, FieldFacts], datasets: bool = False) -> None:
+    """The arguments that say what is trained; `train`, `bench` and `sweep` share them. Only `train` takes ``datasets``."""
     parser.add_argument("algorithm", nargs="?", metavar="ALGORITHM", help=f"one of {', '.join(ALGORITHMS)}")
     parser.add_argument(
-        "environment", nargs="?", metavar="ENVIRONMENT", help="a Gymnasium id, module:Id, path/to/file.py:ClassName, or a dataset's folder"
+        "environment",
+        nargs="?",
+        metavar="ENVIRONMENT",
+        help="a Gymnasium id, module:Id, or path/to/file.py:ClassName" + (", or a dataset's folder" if datasets else ""),
     )
     _add_old_hands_flags(parser)
     parser.add_argument("--steps", type=positive_whole, help="environment steps of each seed: 50000, 50k, 1e6")
@@ -235,7 +238,7 @@ def _last_return(mean_return: float) -> str:
 def _parse(words: Sequence[str]) -> Namespace:
     parser = Parser("train", "Train an agent, or several independent seeds of it in one compiled program.", EXAMPLES)
     algorithm = named_algorithm(words)
-    add_training_arguments(parser, read_config_fields(algorithm) if algorithm in ALGORITHMS else {})
+    add_training_arguments(parser, read_config_fields(algorithm) if algorithm in ALGORITHMS else {}, datasets=True)
     add_output_argument(parser)
     add_devices_argument(parser)
     parser.add_argument(

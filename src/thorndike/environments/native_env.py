@@ -15,6 +15,8 @@ class NativeEnv(gymnasium.Env):
         """Compiles `environment`; where its batch has more than one, all do the same and the first is shown."""
         self.observation_space, self.action_space = environment.spec.observation_space, environment.spec.action_space
         self._num_envs = environment.spec.num_envs
+        self.native_limit = environment.spec.max_episode_steps
+        """The time limit that its steps have already: it has no Gymnasium spec that would say so."""
 
         def first(tree: PyTree) -> PyTree:
             return jax.tree.map(lambda leaf: leaf[0], tree)

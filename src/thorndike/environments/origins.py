@@ -128,7 +128,8 @@ def is_plain(environment: gymnasium.Env) -> bool:
 
 def limit_of(environment: gymnasium.Env) -> int | None:
     """The time limit in force: the least of the wrapped ones and the registered one."""
-    limits = [] if environment.spec is None else [environment.spec.max_episode_steps]
+    limits = [getattr(environment.unwrapped, "native_limit", None)]
+    limits += [] if environment.spec is None else [environment.spec.max_episode_steps]
     while isinstance(environment, gymnasium.Wrapper):
         if isinstance(environment, TimeLimit):
             limits.append(environment._max_episode_steps)

@@ -58,6 +58,12 @@ class Evaluation(NamedTuple):
     rows: tuple[Episode, ...]
     value_bias: Bias | None = None
 
+    def __repr__(self) -> str:
+        """The figures; the episodes, of which there are hundreds, are in ``rows``."""
+        low, high = self.ci95
+        figures = f"mean {self.mean:.4g} (95 % interval {low:.4g} to {high:.4g}), iqm {self.iqm:.4g}, min {self.min:.4g}"
+        return f"Evaluation({self.environment}, {len(self.per_seed)} x {self.episodes} episodes: {figures})"
+
 
 def evaluate(
     policy: Policy,

@@ -104,16 +104,20 @@ class Policy:
         return jax.jit(self.algorithm.value)
 
     def noise(self, key: Key[Array, ""], size: int) -> PyTree:
-        """Noise ``[size, ...]`` of one decision. The algorithm draws for its own number of environments, so several draws are joined."""
-        each = self.spec.num_envs
-        steps = -(-size // each)
+        """Noise ``[size, ...]`` of one decision.
 
-        def join(drawn: Array | Shared) -> Array | Shared:
-            if isinstance(drawn, Shared):
-                return Shared(drawn.numbers[0])
-            return drawn.reshape((steps * each, *drawn.shape[2:]))[:size]
+        The algorithm draws for its own number of environments, so several draws of one step are joined, each from a key of its own: what
+        it draws for successive steps may be correlated. So noise that is coloured in training is white here.
+        """
+        draws = -(-size // self.spec.num_envs)
+        drawn = jax.vmap(lambda key: self.algorithm.draw(key, 1))(jax.random.split(key, draws))
 
-        return jax.tree.map(join, self.algorithm.draw(key, steps), is_leaf=lambda x: isinstance(x, Shared))
+        def join(rows: Array | Shared) -> Array | Shared:
+            if isinstance(rows, Shared):
+                return Shared(rows.numbers[0, 0])
+            return rows.reshape((-1, *rows.shape[3:]))[:size]
+
+        return jax.tree.map(join, drawn, is_leaf=lambda x: isinstance(x, Shared))
 
     def _see(self, statistics: PyTree, memory: PyTree, previous: Observation, obs: Observation) -> tuple[PyTree, Observation]:
         size = jax.tree.leaves(obs)[0].shape[0]

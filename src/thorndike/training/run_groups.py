@@ -201,10 +201,11 @@ def _by_environment(label: str, entries: Sequence[tuple[Trained, ...]], labels: 
 
 def _refuse_mixture(first: Trained, second: Trained) -> None:
     """Seeds count together only if they are different seeds of the same learner."""
-    different = [name for name in first.settings if first.settings[name] != second.settings.get(name)]
+    # A setting that one of them was trained without came with a later version.
+    different = [name for name in first.settings if first.settings[name] != second.settings.get(name, first.settings[name])]
     if different:
         name = different[0]
-        values = f"{first.settings[name]} and {second.settings.get(name)}"
+        values = f"{first.settings[name]} and {second.settings[name]}"
         raise UserError(f"{first.run} and {second.run} are not seeds of the same learner: {name} is {values}; give them as two sides")
     if first.seed == second.seed:
         raise UserError(f"{first.run} and {second.run} hold the same agents, those of seed {first.seed}; train more with another --seed")
