@@ -111,7 +111,10 @@ def test_a_learner_of_a_dataset_is_an_object_like_any_other(made, tmp_path):
     assert learner.learn(20).result.steps == 40
     assert learner.evaluate(2).environment == "CartPole-v1"
     assert learner.predict(made.data.obs[0])[0] in (0, 1)
-    assert td.BC(made.data.path, output=tmp_path, **SMALL).learn(20).result.status == "finished"
+    cloned = td.BC(made.data.path, seeds=2, output=tmp_path, **SMALL).learn(200).result
+    last = json.loads((cloned.run / "metrics.jsonl").read_text().splitlines()[-1])
+    assert len(last["train/grad_norm/actor/policy"]) == len(last["train/effective_rank/actor"]) == 2
+    assert min(last["train/grad_norm/actor/policy"]) > 0 and "train/replay_age" not in last
     with pytest.raises(UserError, match="is a dataset; those that learn from one"):
         td.PPO(made.data, output=tmp_path).learn(20)
 

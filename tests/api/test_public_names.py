@@ -1,5 +1,7 @@
 """The public API: every name can be had, and every learner of an agent has a class."""
 
+from pathlib import Path
+
 import pytest
 
 import thorndike as td
@@ -18,6 +20,8 @@ def test_every_public_name_can_be_had(name):
 
 def test_every_algorithm_that_trains_an_agent_has_a_class():
     assert set(LEARNERS) == set(ALGORITHMS) - {"planning"}
+    page = (Path(__file__).parents[2] / "docs" / "README.md").read_text(encoding="utf-8")
+    assert all(f"`td.{name}`" in page for name in LEARNERS.values())
 
 
 def test_what_there_is_not_is_no_attribute():

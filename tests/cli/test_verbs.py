@@ -16,7 +16,7 @@ from thorndike.algorithms import ALGORITHMS
 from thorndike.cli.main import main
 
 TRAINED = {"run", "status", "steps", "seeds", "wall_s", "cpu_s", "compile_s", "steps_per_s", "steps_per_cpu_s"}
-EVALUATED = {"run", "environment", "episodes", "mean", "iqm", "min", "ci95", "per_seed", "value_bias", "protocol"}
+EVALUATED = {"run", "environment", "protocol", "episodes", "mean", "iqm", "min", "ci95", "per_seed", "value_bias"}
 
 
 def answer(words, capsys):
