@@ -21,8 +21,13 @@ from thorndike.training.datasets import episodes_of
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results" / "offline.json"
 DOCS = ROOT / "docs" / "offline.md"
-SEEDS, EPISODES, UPDATES, LOGS = 10, 10, 4_000, 5
-SIZES = {"net_arch": (64, 64), "batch_size": 128, "learning_rate": 1e-3}
+SEEDS, EPISODES, LOGS = 10, 10, 5
+FRESH = 102
+"""The seed of the agents and of what they record; the settings below were chosen on datasets of agents with seeds below 100.
+
+From 100 on the first with which both agents reach Acrobot's goal: with 100 PPO never does, with 101 its best actions at ``medium`` do not.
+"""
+SIZES = {"net_arch": (64, 64), "batch_size": 128}
 
 
 class Task(NamedTuple):
@@ -35,6 +40,8 @@ class Task(NamedTuple):
     expert_steps: int
     mixture: tuple[int, int, int]
     """Steps of random, medium and expert actions."""
+    updates: int
+    learning_rate: float | str
     learners: dict[str, dict]
 
 
@@ -44,15 +51,15 @@ PENDULUM = {
     "td3_bc": {"alpha": 10.0, "tau": 0.02},
     "cql": {"alpha": 1.0, "n_actions": 4, "tau": 0.01},
 }
-CARTPOLE = {
+ACROBOT = {
     "bc": {},
-    "iql": {"temperature": 0.3, "expectile": 0.9, "tau": 0.02},
-    "cql": {"alpha": 0.3, "tau": 0.02},
+    "iql": {"temperature": 1.0, "expectile": 0.9, "tau": 0.02},
+    "cql": {"alpha": 1.0, "tau": 0.01},
 }
 SAC = {"net_arch": (64, 64), "learning_rate": 1e-3, "learning_starts": 500}
 TASKS = (
-    Task("Pendulum-v1", "sac", SAC, 3_000, 15_000, (10_000, 8_000, 2_000), PENDULUM),
-    Task("CartPole-v1", "ppo", {}, 10_000, 100_000, (8_000, 6_000, 2_000), CARTPOLE),
+    Task("Acrobot-v1", "ppo", {}, 25_000, 100_000, (10_000, 6_000, 1_000), 10_000, "linear(1e-3, 0)", ACROBOT),
+    Task("Pendulum-v1", "sac", SAC, 3_000, 15_000, (10_000, 8_000, 2_000), 4_000, 1e-3, PENDULUM),
 )
 DATASETS = ("mixed", "random", "medium", "expert")
 
@@ -60,7 +67,7 @@ DATASETS = ("mixed", "random", "medium", "expert")
 def make_agents(task: Task, folder: Path) -> dict[str, Path]:
     """The runs that record: one stopped early, and one trained well."""
     levels = (("medium", task.medium_steps), ("expert", task.expert_steps))
-    asked = {"settings": task.settings, "preset": "none", "output": folder / "runs"}
+    asked = {"settings": task.settings, "preset": "none", "seed": FRESH, "output": folder / "runs"}
     return {level: td.train(task.agent, task.environment, steps=steps, **asked).run for level, steps in levels}
 
 
@@ -71,21 +78,22 @@ def make_dataset(task: Task, name: str, agents: dict[str, Path], folder: Path) -
         parts = []
         for steps, (kind, (agent, share)) in zip(task.mixture, kinds.items(), strict=True):
             to = folder / task.environment / f"part-{kind}-v0"
-            parts.append(td.record(agents[agent], steps=steps, random_share=share, seed=1, to=to).path)
+            parts.append(td.record(agents[agent], steps=steps, random_share=share, seed=FRESH, to=to).path)
         return td.mix(*parts, to=folder / task.environment / "mixed-v0").path
     agent, share = kinds[name]
     to = folder / task.environment / f"{name}-v0"
-    return td.record(agents[agent], steps=sum(task.mixture), random_share=share, to=to).path
+    return td.record(agents[agent], steps=sum(task.mixture), random_share=share, seed=FRESH, to=to).path
 
 
 def score(task: Task, name: str, place: Path, folder: Path) -> dict:
     """A dataset's own returns, and what each learner makes of it."""
     data, learners = td.dataset(place), {}
     for learner, settings in task.learners.items():
-        made = td.train(learner, str(place), steps=UPDATES, seeds=SEEDS, settings=SIZES | settings, output=folder / "runs")
+        asked = SIZES | {"learning_rate": task.learning_rate} | settings
+        made = td.train(learner, str(place), steps=task.updates, seeds=SEEDS, settings=asked, output=folder / "runs")
         found = td.load(made.run).evaluate(EPISODES)
         learners[learner] = {part: getattr(found, part) for part in ("mean", "iqm", "min", "ci95", "per_seed")}
-        learners[learner] |= {"settings": SIZES | settings, "updates": UPDATES, "cpu_s": made.cpu_s}
+        learners[learner] |= {"settings": asked, "updates": task.updates, "cpu_s": made.cpu_s}
         print(f"{task.environment} {name} {learner}: {found.mean:.1f} ({made.cpu_s:.0f} CPU-s)", file=sys.stderr, flush=True)
     facts = {"environment": task.environment, "dataset": name, "steps": len(data.reward), "episodes": len(data.lengths)}
     return facts | {"behavior": float(data.returns.mean()), "best_episode": float(data.returns.max()), "learners": learners}
@@ -161,7 +169,7 @@ def keep(part: str, found: dict) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("parts", nargs="*", default=["Pendulum-v1", "CartPole-v1", "evaluation"])
+    parser.add_argument("parts", nargs="*", default=["Acrobot-v1", "Pendulum-v1", "evaluation"])
     parser.add_argument("--datasets", nargs="*", default=DATASETS)
     parser.add_argument("--tables", action="store_true")
     options = parser.parse_args()

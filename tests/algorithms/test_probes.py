@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
 
+import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,11 +17,14 @@ import pytest
 from thorndike.algorithms import (
     a2c,
     a3c,
+    awac,
     bootstrapped_dqn,
+    cql,
     crossq,
     ddpg,
     dqn,
     impala,
+    iql,
     iqn,
     ppo,
     pqn,
@@ -31,6 +35,7 @@ from thorndike.algorithms import (
     reinforce,
     sac,
     td3,
+    td3_bc,
     tqc,
     trpo,
 )
@@ -41,7 +46,7 @@ from thorndike.environments.native.vectorize import vectorize
 from thorndike.environments.probes import PROBES, TIME_LIMIT, Probe
 from thorndike.training.runner import runner
 from thorndike.training.sources import compiled_source
-from thorndike.types import Algorithm, Environment, EnvSpec, Wrapper
+from thorndike.types import Algorithm, Environment, EnvSpec, EpisodeStats, Rollout, Source, Wrapper
 
 SEEDS, NUM_ENVS, GAMMA = 10, 8, 0.9
 TOLERANCE, PROBABILITY = 0.05, 0.95
@@ -131,6 +136,48 @@ def learn(probes: tuple[Probe, ...], build, iterations: int, wrapper: Wrapper | 
     carry, _ = bound.advance(carry, 0, iterations)
     algorithm = algorithm._replace(act=algorithm.greedy) if noisy else algorithm
     return Learnt(probes, jax.vmap(algorithm.actor)(carry.learner), carry.source.statistics, algorithm, wrapper)
+
+
+def random_steps(environment: Environment, steps: int) -> Rollout:
+    """``steps`` steps of uniform actions, one after another, as a learner from data sees them."""
+    box, total = isinstance(environment.spec.action_space, gymnasium.spaces.Box), steps // NUM_ENVS
+    dice = jax.random.uniform(jax.random.key(2), (total, NUM_ENVS))
+    actions = 2.0 * dice[..., None] - 1.0 if box else (2.0 * dice).astype(jnp.int32)
+
+    def one(carry, drawn):
+        state, obs = carry
+        action, noise = drawn
+        state, step = environment.step(state, action, noise)
+        return (state, step.obs), Rollout(obs, action, {}, step, ())
+
+    noise = environment.draw(jax.random.key(3), total)
+    _, rows = jax.lax.scan(one, environment.init(jax.random.key(4)), (actions, noise))
+    return jax.tree.map(lambda leaf: leaf.reshape(steps, *leaf.shape[2:]), rows)
+
+
+def learn_from_data(probes: tuple[Probe, ...], build, updates: int) -> Learnt:
+    """``learn`` from 4,000 steps of uniform actions on each probe, none of which is stepped while it learns."""
+    algorithm = build(several(probes, 0).spec._replace(num_envs=1, engine="dataset"))
+    rows = jax.jit(jax.vmap(lambda number: random_steps(several(probes, number), 4_000)))(jnp.arange(len(probes)))
+    length, size = algorithm.needs.rollout_length, algorithm.needs.batch_size
+
+    def collect(number, actor, drawn):
+        counted = EpisodeStats(*[jnp.zeros((), jnp.float32)] * 3, jnp.full((), length, jnp.float32))
+        return number, jax.tree.map(lambda leaf: leaf[number, drawn], rows), counted
+
+    source = Source(
+        init=lambda key: jnp.zeros((), jnp.int32),
+        draw=lambda key, iterations: jax.random.randint(key, (iterations, length, size), 0, 4_000),
+        collect=collect,
+        statistics=lambda number: (),
+        spec=several(probes, 0).spec,
+        compiled=True,
+    )
+    which = jnp.repeat(jnp.arange(len(probes), dtype=jnp.int32), SEEDS)
+    bound = runner(algorithm, source, 0, range(len(which)))
+    carry, _ = bound.advance(bound.init()._replace(source=which), 0, updates // length)
+    plain, asked = wrappers.chain(), algorithm._replace(act=algorithm.greedy)
+    return Learnt(probes, jax.vmap(algorithm.actor)(carry.learner), (), asked, plain)
 
 
 def check_values(learnt: Learnt, number: int) -> None:
@@ -239,6 +286,13 @@ def control_for(iterations: int, learner, spec: EnvSpec, **parts) -> Algorithm:
     return getattr(learner, name)(learner.Config(**(config | parts)), spec)
 
 
+def offline_for(updates: int, learner, spec: EnvSpec, **parts) -> Algorithm:
+    """A learner from data: a module of ``thorndike.algorithms``."""
+    name = learner.__name__.rpartition(".")[2]
+    config = {"total_steps": updates, "learning_rate": "linear(0.01, 0)", "batch_size": 64, "tau": 0.05, "gamma": GAMMA, "net_arch": (16,)}
+    return getattr(learner, name)(learner.Config(**(config | parts)), spec)
+
+
 def table_for(iterations: int, variant: str, spec: EnvSpec) -> Algorithm:
     config = q_learning.Config(
         total_steps=iterations * 8 * NUM_ENVS,
@@ -296,6 +350,13 @@ SLOW_CASES = {
     "dqn, reset": lambda: learn(DISCRETE, partial(dqn_for, 2400, reset_every=801 * NUM_ENVS), 2400),
     "qr_dqn": lambda: learn(DISCRETE, partial(dqn_for, 1200, learner=qr_dqn, n_quantiles=8), 1200),
     "iqn": lambda: learn(DISCRETE, partial(dqn_for, 1600, learner=iqn, n_quantiles=8, net_arch=(32, 32)), 1600),
+    # Expectiles near 1 and little conservatism: the values are then those of the best policy.
+    "iql": lambda: learn_from_data(DISCRETE, partial(offline_for, 2000, iql, expectile=0.99, temperature=0.1), 2000),
+    "iql, Box": lambda: learn_from_data(BOX, partial(offline_for, 4000, iql, expectile=0.99, temperature=0.02), 4000),
+    "cql": lambda: learn_from_data(DISCRETE, partial(offline_for, 2000, cql, alpha=0.01), 2000),
+    "cql, Box": lambda: learn_from_data(BOX, partial(offline_for, 2000, cql, alpha=0.01, n_actions=4), 2000),
+    "td3_bc": lambda: learn_from_data(BOX, partial(offline_for, 2000, td3_bc, alpha=100.0), 2000),
+    "awac": lambda: learn_from_data(BOX, partial(offline_for, 4000, awac, temperature=0.02), 4000),
     "sarsa": lambda: learn(DISCRETE, partial(table_for, 100, "sarsa"), 100, wrappers.discretise(3)),
     "expected sarsa": lambda: learn(DISCRETE, partial(table_for, 100, "expected_sarsa"), 100, wrappers.discretise(3)),
     "double q": lambda: learn(DISCRETE, partial(table_for, 100, "double_q"), 100, wrappers.discretise(3)),
