@@ -77,5 +77,6 @@ def choose_device(device: str, large: bool, processors: int | None = None) -> st
     try:
         return jax.default_backend()
     except (RuntimeError, AssertionError) as error:
-        # The second where this build of JAX does not know the platform at all.
-        raise UserError(f"--device {device}: JAX has no such device here ({str(error).splitlines()[0]}); use --device cpu") from error
+        # The second, without a word, where this build of JAX does not know the platform at all.
+        why = (str(error) or f"this build of JAX knows no {wanted}").splitlines()[0]
+        raise UserError(f"--device {device}: JAX has no such device here ({why}); use --device cpu") from error
