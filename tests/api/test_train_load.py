@@ -123,7 +123,8 @@ def test_evaluation_plays_the_same_episodes_of_every_seed_and_keeps_them(run):
     assert found.min <= found.mean and found.ci95[0] <= found.mean <= found.ci95[1]
     lines = [json.loads(line) for line in (run / "evaluations.jsonl").read_text().splitlines()]
     assert len(lines) == 6 * SEEDS
-    assert set(lines[0]) == {"evaluation_seed", "deterministic", "seed", "episode", "return", "length", "terminated"}
+    kept = {"evaluation_seed", "deterministic", "seed", "episode", "return", "length", "terminated", "value", "discounted_return"}
+    assert set(lines[0]) == kept
     assert all(line["return"] == line["length"] for line in lines), "CartPole pays 1 a step, and no normalised reward"
     assert policy.evaluate(episodes=6, seed=3) == found
 
