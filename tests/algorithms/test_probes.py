@@ -355,7 +355,7 @@ SLOW_CASES = {
     "iql, Box": lambda: learn_from_data(BOX, partial(offline_for, 4000, iql, expectile=0.99, temperature=0.02), 4000),
     "cql": lambda: learn_from_data(DISCRETE, partial(offline_for, 2000, cql, alpha=0.01), 2000),
     "cql, Box": lambda: learn_from_data(BOX, partial(offline_for, 2000, cql, alpha=0.01, n_actions=4), 2000),
-    "td3_bc": lambda: learn_from_data(BOX, partial(offline_for, 2000, td3_bc, alpha=100.0), 2000),
+    "td3_bc": lambda: learn_from_data(BOX, partial(offline_for, 4000, td3_bc, alpha=100.0), 4000),
     "awac": lambda: learn_from_data(BOX, partial(offline_for, 4000, awac, temperature=0.02), 4000),
     "sarsa": lambda: learn(DISCRETE, partial(table_for, 100, "sarsa"), 100, wrappers.discretise(3)),
     "expected sarsa": lambda: learn(DISCRETE, partial(table_for, 100, "expected_sarsa"), 100, wrappers.discretise(3)),
