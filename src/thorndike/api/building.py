@@ -269,13 +269,14 @@ def build_job(
         )
         spec, source, algorithm, plan, close = _on_host(request, engine, wrapper, build, indices)
     if not algorithm.needs.on_policy:
+        source_spec = (source.source if isinstance(source, HostSource) else source).spec
         buffer_size = request.config.get("buffer_size")
         check_memory(
             request.algorithm,
             algorithm,
             len(indices),
             buffer_size if isinstance(buffer_size, int) else None,
-            twice=choice.engine != "native" and len(indices) > 1,
+            twice=choice.engine != "native" and (len(indices) > 1 or source_spec.frames == 1),
         )
     bound = runner(algorithm, source, request.seed, indices, devices_for(len(indices), devices))
     return Job(request, algorithm, wrapper, spec, source, bound, plan, close)
