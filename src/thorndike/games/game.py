@@ -1,6 +1,6 @@
 """What a game is, and what a player is: pure functions of one position for the compiled loop, and a little for people to see it.
 
-A position has no batch axis: ``jax.vmap`` makes batches. Player 0 is who moves first; rewards are always by player, never by who is to move.
+A position has no batch axis: ``jax.vmap`` makes batches. Player 0 moves first; rewards are always by player, never by who is to move.
 """
 
 from collections.abc import Callable, Mapping
