@@ -304,9 +304,10 @@ def _accepts(id: str, settings: dict[str, object]) -> bool:
 
 
 def _gymnasium_has(name: str) -> bool:
-    from thorndike.environments.origins import class_in_file, is_known_id
+    from thorndike.environments.origins import is_known_id
+    from thorndike.user_code import attribute_in_file
 
-    if class_in_file(name) is not None or is_known_id(name):
+    if attribute_in_file(name) is not None or is_known_id(name):
         return True
     # ``module:ClassName``: the module is there; whether the class is, making it says.
     return ":" in name
