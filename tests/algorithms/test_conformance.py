@@ -45,7 +45,8 @@ from thorndike.training.checkpoints import Progressed, restore, save_checkpoint
 from thorndike.training.dataset_source import dataset_source, dataset_spec
 from thorndike.training.policy import Policy
 from thorndike.training.run_directory import checkpoints
-from thorndike.training.runner import Carry, Runner, runner
+from thorndike.training.runner import Runner, runner
+from thorndike.training.segment import Carry
 from thorndike.training.sources import compiled_source
 from thorndike.types import Algorithm, Source, Wrapper
 
