@@ -61,11 +61,12 @@ def _as_pgx_is_written() -> AbstractContextManager[None]:
 def pgx_game(id: str) -> Game:
     """The game of a pgx id. Raises UserError where pgx is missing or of an untested version."""
     check_version()
-    import pgx
-
-    env = pgx.make(id)
     module, attribute = FACES[id]
-    face: Face = getattr(importlib.import_module(module), attribute)
+    with _as_pgx_is_written():
+        import pgx
+
+        env = pgx.make(id)
+        face: Face = getattr(importlib.import_module(module), attribute)
 
     def light(state: Position) -> Position:
         """Without what can be computed again, and with types that a loop can carry."""

@@ -1,0 +1,78 @@
+"""Engines that speak the Go Text Protocol, version 2 (Farnebäck 2002): GNU Go, and GRhino for Othello."""
+
+import time
+
+from thorndike.games.engine_player import Answered, Dialogue, Start, started
+from thorndike.games.engine_process import EngineFailure, EngineProcess
+from thorndike.games.game import Turn
+
+_COLOURS = ("black", "white")
+_PATIENCE_S = 10.0
+"""For everything but a move."""
+
+
+def gtp_start(command: tuple[str, ...], size: int, komi: float | None, move_limit_s: float, passes_are_told: bool = True) -> Start:
+    """How to start an engine on boards of ``size``; it is given up on if a move takes longer than ``move_limit_s``."""
+
+    def start() -> Dialogue:
+        known: list[int] = []
+        """The actions that the engine has played on its board."""
+
+        def begin(process: EngineProcess) -> None:
+            told(process, f"boardsize {size}")
+            told(process, "clear_board")
+            if komi is not None:
+                told(process, f"komi {komi}")
+
+        process = started(command, begin)
+
+        def catch_up(turn: Turn) -> None:
+            if list(turn.moves[: len(known)]) != known:
+                begin(process)
+                known.clear()
+            # Who plays which move, and its name, depend on the position it was played in.
+            if len(known) < len(turn.moves):
+                for ply, (colour, name) in enumerate(named_moves(turn)):
+                    if ply >= len(known) and (passes_are_told or name != "pass"):
+                        told(process, f"play {colour} {name}")
+            known[:] = turn.moves
+
+        def ask(turn: Turn) -> Answered:
+            catch_up(turn)
+            colour = _COLOURS[int(turn.game.player(turn.position))]
+            # It plays its move on its board too, which we take back: the match decides what is played.
+            move = told(process, f"genmove {colour}", move_limit_s)
+            if move.lower() != "resign":
+                told(process, "undo")
+            return Answered(move)
+
+        return Dialogue(ask, process.close)
+
+    return start
+
+
+def named_moves(turn: Turn) -> list[tuple[str, str]]:
+    """Colour and name of each move so far."""
+    import jax
+
+    game, key = turn.game, jax.random.key(0)
+    position, found = game.init(key), []
+    for action in turn.moves:
+        found.append((_COLOURS[int(game.player(position))], game.action_name(position, action)))
+        position = game.step(position, jax.numpy.int32(action), key)
+    return found
+
+
+def told(process: EngineProcess, command: str, limit_s: float = _PATIENCE_S) -> str:
+    """What the engine answers to a command. Raises ``EngineFailure`` if it refuses it, or does not answer."""
+    until = time.monotonic() + limit_s
+    process.send(command)
+    first = ""
+    while not first.startswith(("=", "?")):
+        first = process.line(until)
+    lines = [first[1:].strip()]
+    while line := process.line(until):
+        lines.append(line)
+    if first.startswith("?"):
+        raise EngineFailure(f"refused '{command}': {lines[0][:80]}")
+    return "\n".join(lines)
