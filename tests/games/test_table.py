@@ -8,6 +8,7 @@ import pytest
 
 from thorndike.errors import UserError
 from thorndike.games.game import Choice, Player, Turn
+from thorndike.games.plies import line_names, target_square
 from thorndike.games.registry import game
 from thorndike.games.saved_game import read_saved_game, saved_actions, saved_game_file
 from thorndike.games.seats import computer, person
@@ -75,7 +76,10 @@ def test_an_illegal_click_says_why_and_changes_nothing(square, why):
 def test_a_piece_falls_and_its_square_is_the_one_it_falls_on():
     table = played(persons(CONNECT_FOUR), (0, 3), (2, 3))
     assert [table.view().plies[-1].board.rows[row][3] for row in (5, 4, 3)] == ["X", "O", ""]
-    assert table.target(2, 3) == (3, 3) and table.target(0, 3) == (5, 3) and table.target(2, 0) == (5, 0)
+    first, third = table.view().plies[0], table.view().plies[2]
+    assert target_square(CONNECT_FOUR, third, 3) == (3, 3) and target_square(CONNECT_FOUR, first, 3) == (5, 3)
+    assert target_square(CONNECT_FOUR, third, 0) == (5, 0)
+    assert line_names(CONNECT_FOUR, third, [3, 0, 3, 9, 1], 8) == ("d", "a", "d")
 
 
 def test_a_full_column_is_refused():

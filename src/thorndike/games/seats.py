@@ -27,10 +27,13 @@ def computer(player: Player) -> Seat:
     return Seat(player.name, player, threading.Lock())
 
 
-def leave(seats: Iterable[Seat]) -> None:
-    """Close players that are needed no more, each as soon as it has ended thinking."""
-    for seat in {id(seat.player): seat for seat in seats if seat.player is not None}.values():
-        threading.Thread(target=_close, args=(seat,), daemon=True, name=f"closing {seat.name}").start()
+def leave(seats: Iterable[Seat]) -> list[threading.Thread]:
+    """Close players that are needed no more, each as soon as it has ended thinking: in threads, which are given back."""
+    alone = {id(seat.player): seat for seat in seats if seat.player is not None}.values()
+    threads = [threading.Thread(target=_close, args=(seat,), daemon=True, name=f"closing {seat.name}") for seat in alone]
+    for thread in threads:
+        thread.start()
+    return threads
 
 
 def _close(seat: Seat) -> None:

@@ -8,12 +8,9 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
-import numpy as np
-
 from thorndike.errors import UserError
-from thorndike.games.game import Board, Choice, Game, Position, Square, Turn
+from thorndike.games.game import Choice, Game, Square, Turn
+from thorndike.games.plies import Ply, first_ply, next_ply
 from thorndike.games.seats import Seat, leave
 from thorndike.games.squares import begins_a_move, why_not
 
@@ -24,18 +21,6 @@ class Outcome(NamedTuple):
     winner: int | None
     """None: a draw, or a game of one player."""
     resigned: bool = False
-
-
-class Ply(NamedTuple):
-    """A position of the game, and what led there and is allowed there."""
-
-    position: Position
-    board: Board
-    legal: tuple[int, ...]
-    """In order; empty when the game is over."""
-    player: int
-    rewards: tuple[float, ...]
-    """Earned by the move that led here."""
 
 
 class View(NamedTuple):
@@ -93,7 +78,7 @@ class Table:
         self._listeners: list[Callable[[], None]] = []
         self._task: _Task | None = None
         self._analyse = False
-        self._start = self._ply(game.init(jax.random.key(seed)), (0.0,) * game.num_players)
+        self._start = first_ply(game, seed)
         self._resigned: int | None = None
         self._clear()
 
@@ -199,12 +184,12 @@ class Table:
             self._clear()
             self._changed()
 
-    def close(self) -> None:
-        """Nobody thinks any more, and the players are closed."""
+    def close(self) -> list[threading.Thread]:
+        """Nobody thinks any more, and the players are closed, in the threads that are given back."""
         with self._lock:
             self._task, self._paused, self._analyse = None, True, False
             self._listeners.clear()
-        leave(seat for seat in (*self._seats, self._analyst) if seat is not None)
+        return leave(seat for seat in (*self._seats, self._analyst) if seat is not None)
 
     def show(self, number: int) -> None:
         """Look at the position after so many moves."""
@@ -240,27 +225,10 @@ class Table:
                 if action not in plies[-1].legal:
                     raise UserError(f"move {number} of {len(actions)} is not legal")
                 names.append(self.game.action_name(plies[-1].position, action))
-                plies.append(self._after(plies[-1], action, number - 1))
+                plies.append(next_ply(self.game, plies[-1], action, self.seed))
             self._clear()
             self._plies, self._moves, self._names, self._choices = plies, list(actions), names, dict(choices)
             self._changed()
-
-    def target(self, number: int, action: int) -> Square | None:
-        """The square of a move in the position after ``number`` moves: where it puts something; None for one that is no click."""
-        with self._lock:
-            ply = self._plies[number]
-        clicked = [squares for squares, of in ply.board.clicks.items() if of == action]
-        if not clicked:
-            return None
-        if len(clicked) == 1:
-            return clicked[0][-1]
-        # Many squares mean this move, as those of a column do: it is the one on which something appears.
-        after = self._after(ply, action, number).board.rows
-        for squares in clicked:
-            row, column = squares[-1]
-            if after[row][column] != ply.board.rows[row][column]:
-                return row, column
-        return clicked[0][-1]
 
     # What follows is called with the lock held.
 
@@ -278,7 +246,7 @@ class Table:
     def _play(self, action: int) -> None:
         ply = self._plies[-1]
         self._names.append(self.game.action_name(ply.position, action))
-        self._plies.append(self._after(ply, action, len(self._moves)))
+        self._plies.append(next_ply(self.game, ply, action, self.seed))
         followed = self._shown == len(self._moves)
         self._moves.append(action)
         if followed:
@@ -299,16 +267,6 @@ class Table:
             return None
         best = max(last.rewards)
         return Outcome(last.rewards.index(best) if len(last.rewards) == 2 and best > 0 else None)
-
-    def _after(self, ply: Ply, action: int, number: int) -> Ply:
-        key = jax.random.fold_in(jax.random.key(self.seed), number)
-        position = jax.jit(self.game.step)(ply.position, jnp.int32(action), key)
-        return self._ply(position, tuple(map(float, np.asarray(jax.jit(self.game.rewards)(position)))))
-
-    def _ply(self, position: Position, rewards: tuple[float, ...]) -> Ply:
-        over = bool(jax.jit(self.game.terminated)(position))
-        legal = () if over else tuple(map(int, np.flatnonzero(np.asarray(jax.jit(self.game.legal)(position)))))
-        return Ply(position, self.game.board(position), legal, int(jax.jit(self.game.player)(position)), rewards)
 
     def _changed(self) -> None:
         wanted = self._wanted()
