@@ -7,10 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from thorndike import startup
-
-startup.prepare()
-
 from thorndike.errors import UserError
 from thorndike.games.game import Choice, Game, Player, Turn
 from thorndike.web.opponents import Opponent

@@ -56,8 +56,8 @@ class _BoardPage:
         self._follow()
 
     def _add_board_side(self) -> None:
+        Tag("h1", "visually-hidden", self._look.title)
         with Tag("div", "status", "", {"aria-live": "polite", "aria-atomic": "true"}):
-            Tag("h1", "visually-hidden", self._look.title)
             self._status = Tag("p", "status-line")
             self._hint = Tag("p", "hint")
         self._board = BoardElement()
@@ -68,26 +68,29 @@ class _BoardPage:
             self._stop = button("Stop thinking", self._doing(lambda: self._table.interrupt()), "primary")
             self._go_on = button("Let it play", self._doing(lambda: self._table.go_on()), "primary")
             self._take_back = button("Take back", self._doing(lambda: self._table.take_back()))
-            button("Swap sides", self._doing(lambda: self._table.swap_sides()))
-            button("New game", self._doing(lambda: self._table.restart()))
+            button("Swap sides", self._doing(lambda: self._studio.swap_sides(self._name)))
+            self._restart = button("New game", self._doing(lambda: self._table.restart()), asks=True)
             button("Save", self._save)
 
     def _add_side(self, place: Place) -> None:
-        self._players = [Tag("p", "player") for _ in self._look.sides[: self._table.game.num_players]]
+        with Tag("div", "players"):
+            self._players = [Tag("p", "player") for _ in self._look.sides[: self._table.game.num_players]]
         with Tag("section", "panel", "", {"aria-label": "Win probability"}):
-            Tag("h2", "", "Win probability")
+            with Tag("div", "heading"):
+                Tag("h2", "", "Win probability")
+                self._chance = Tag("span", "chance")
             self._chances = ui.html("", sanitize=False)
-            checkbox("Show what the search thinks", self._analyse, self._table.view().analyse)
+            self._thoughts = checkbox("Show what the search thinks", self._analyse)
             self._analysis = Tag("p", "analysis", "", {"aria-live": "polite"})
         with Tag("section", "panel", "", {"aria-label": "Moves"}):
             Tag("h2", "", "Moves")
             self._list = Tag("ol", "moves")
             with Tag("div", "replay", "", {"role": "group", "aria-label": "Step through the game"}):
-                button("⏮\ufe0e", self._step(lambda view: 0), "icon", {"aria-label": "To the beginning"})
-                button("◀\ufe0e", self._step(lambda view: view.shown - 1), "icon", {"aria-label": "One move back"})
+                button("«", self._step(lambda view: 0), "icon", {"aria-label": "To the beginning"})
+                button("‹", self._step(lambda view: view.shown - 1), "icon", {"aria-label": "One move back"})
                 self._slider = slider("Position: arrow keys step through the game", self._slide)
-                button("▶\ufe0e", self._step(lambda view: view.shown + 1), "icon", {"aria-label": "One move on"})
-                button("⏭\ufe0e", self._step(lambda view: len(view.moves)), "icon", {"aria-label": "To the last move"})
+                button("›", self._step(lambda view: view.shown + 1), "icon", {"aria-label": "One move on"})
+                button("»", self._step(lambda view: len(view.moves)), "icon", {"aria-label": "To the last move"})
         with Tag("details", "panel"):
             Tag("summary", "", "Change the opponent")
             self._form = SetupForm(self._studio, place.setup)
@@ -131,12 +134,17 @@ class _BoardPage:
         self._draw_buttons(tuple(view.ply.board.buttons) if drawn.board["playable"] else ())
         self._stop.set_attribute("hidden", None if view.thinking else True)
         self._go_on.set_attribute("hidden", None if view.paused and not drawn.over else True)
+        self._restart.set_attribute(
+            "data-asks", "Begin a new game? The moves of this one are lost." if view.moves and not drawn.over else None
+        )
         self._take_back.set_attribute("disabled", None if view.moves else True)
         for number, (line, seat) in enumerate(zip(self._players, view.seats, strict=True)):
             line.set_text(f"{self._look.sides[number]}: {seat.name}")
             turn = number == view.ply.player and view.at_end and not drawn.over
             line.classes(replace=f"player of-{self._look.pieces} {('first', 'second')[number]} {'turn' if turn else ''}")
+        self._chance.set_text(drawn.chance)
         self._chances.content = probability_line(drawn.probabilities, view.shown, *self._look.sides)
+        self._thoughts.set_attribute("checked", view.analyse)
         self._analysis.set_text(drawn.analysis)
         self._draw_moves(view)
         self._form.show(place.setup if (place := self._studio.place(self._name)) else self._form.setup)

@@ -24,10 +24,14 @@ class Tag(TextElement):
             self.props.set_optional(name, value)
 
 
-def button(text: str, handler: Handler, classes: str = "", attributes: Mapping[str, object] | None = None) -> Tag:
-    """A button that does one thing."""
+def button(text: str, handler: Handler, classes: str = "", attributes: Mapping[str, object] | None = None, asks: bool = False) -> Tag:
+    """A button that does one thing. ``asks``: not before the question in its attribute ``data-asks``, if there is one, is answered."""
     element = Tag("button", f"button {classes}", text, {"type": "button", **(attributes or {})})
-    element.on("click", handler, [])
+    if asks:
+        question = "event.currentTarget.dataset.asks"
+        element.on("click", handler, [], js_handler=f"(event) => {{ if (!{question} || confirm({question})) emit(); }}")
+    else:
+        element.on("click", handler, [])
     return element
 
 

@@ -5,6 +5,7 @@ from nicegui import run, ui
 from thorndike.games.saved_game import LARGEST
 from thorndike.web.controls import Tag, button, link, open_file
 from thorndike.web.frame import frame
+from thorndike.web.icons import game_icon
 from thorndike.web.looks import look_of
 from thorndike.web.setup_form import SetupForm
 from thorndike.web.studio import Place, Setup, Studio
@@ -31,6 +32,7 @@ def add_home(studio: Studio) -> None:
                 for game_id in studio.games:
                     look = look_of(game_id)
                     with Tag("li"), link("", f"/new/{game_id}", "card"):
+                        ui.html(game_icon(look.pieces), sanitize=False, tag="span")
                         Tag("strong", "", look.title)
                         Tag("span", "", look.rule)
             if being_played:

@@ -15,12 +15,14 @@ class Look(NamedTuple):
     """Of the player who moves first, and of the other."""
     rule: str
     """In one line, what it is about."""
+    line: int = 0
+    """How many in a row win, where that is how one wins."""
 
 
 LOOKS: Mapping[str, Look] = MappingProxyType(
     {
-        "tic_tac_toe": Look("Tic-tac-toe", "marks", ("X", "O"), "Three in a row, on nine squares."),
-        "connect_four": Look("Connect Four", "discs", ("Red", "Yellow"), "Pieces fall; four in a row win."),
+        "tic_tac_toe": Look("Tic-tac-toe", "marks", ("X", "O"), "Three in a row, on nine squares.", line=3),
+        "connect_four": Look("Connect Four", "discs", ("Red", "Yellow"), "Pieces fall; four in a row win.", line=4),
         "othello": Look("Othello", "stones", ("Black", "White"), "Enclose the other's stones to turn them; most stones win."),
         "hex": Look("Hex", "hex", ("Red", "Blue"), "Join your two sides of the board."),
         "go_9x9": Look("Go 9x9", "go", ("Black", "White"), "Enclose more of the small board."),

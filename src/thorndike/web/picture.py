@@ -25,6 +25,8 @@ class Picture(NamedTuple):
     """By position: how likely the first player wins."""
     analysis: str
     """What the search says about the position looked at."""
+    chance: str
+    """The latest of them up to the position looked at, in words."""
     over: bool
 
 
@@ -33,7 +35,7 @@ def picture(game: Game, view: View) -> Picture:
     look, ply = look_of(game.id), view.ply
     choice = view.choices.get(view.shown)
     shares = _shares(game, ply, choice, view.pending) if choice is not None and view.analyse else {}
-    last = _last_square(game, view)
+    last, probabilities = _last_square(game, view), _probabilities(view)
     return Picture(
         status=_status(look, view),
         hint=_hint(view),
@@ -44,12 +46,14 @@ def picture(game: Game, view: View) -> Picture:
             "columnNames": ply.board.column_names,
             "labels": _labels(look, view, shares, last),
             "last": last,
+            "line": _winning_line(look, ply.board.rows) if view.outcome is not None and view.at_end else (),
             "pending": view.pending,
             "shares": [[*square, share] for square, share in shares.items()],
             "playable": _is_persons_turn(view),
             "side": ply.player,
         },
-        probabilities=_probabilities(view),
+        probabilities=probabilities,
+        chance=_chance(look, probabilities[: view.shown + 1]),
         analysis=_analysis(game, look, view, choice),
         over=view.outcome is not None,
     )
@@ -103,6 +107,19 @@ def _hint(view: View) -> str:
 
 def _last_square(game: Game, view: View) -> Square | None:
     return target_square(game, view.plies[view.shown - 1], view.moves[view.shown - 1]) if view.shown else None
+
+
+def _winning_line(look: Look, rows: tuple[tuple[str, ...], ...]) -> tuple[Square, ...]:
+    """The squares of a row of equal pieces that is long enough, if that is how this game is won."""
+    for row in range(len(rows)):
+        for column in range(len(rows[row])):
+            for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
+                squares = [(row + step * down, column + step * right) for step in range(look.line)]
+                pieces = {rows[r][c] for r, c in squares if r < len(rows) and 0 <= c < len(rows[r])}
+                inside = all(r < len(rows) and 0 <= c < len(rows[r]) for r, c in squares)
+                if squares and inside and len(pieces) == 1 and "" not in pieces:
+                    return tuple(squares)
+    return ()
 
 
 def _shares(game: Game, ply: Ply, choice: Choice, pending: tuple[Square, ...]) -> dict[Square, float]:
@@ -161,6 +178,11 @@ def _probabilities(view: View) -> tuple[float | None, ...]:
     return tuple(told)
 
 
+def _chance(look: Look, told: tuple[float | None, ...]) -> str:
+    known = [chance for chance in told if chance is not None]
+    return f"{look.sides[0]} {known[-1]:.0%}" if known else ""
+
+
 def _analysis(game: Game, look: Look, view: View, choice: Choice | None) -> str:
     if not view.analyse:
         return ""
@@ -170,7 +192,7 @@ def _analysis(game: Game, look: Look, view: View, choice: Choice | None) -> str:
     if choice.win_probability is not None:
         parts.append(f"{look.sides[ply.player]} wins with {choice.win_probability:.0%}")
     if choice.visits:
-        parts.append(f"{sum(choice.visits.values()):,} visits")
+        parts.append(f"{sum(choice.visits.values()):,} visits, their shares on the board")
     line = line_names(game, ply, choice.principal_variation, _LONGEST_LINE)
     if line:
         parts.append(f"expected: {' '.join(line)}")

@@ -25,6 +25,8 @@ def probability_line(chances: Sequence[float | None], shown: int, first: str, se
     parts.append(f'<line class="now" x1="{at:.1f}" y1="0" x2="{at:.1f}" y2="{_HEIGHT}"/>')
     if points:
         parts.append(f'<polyline class="line" points="{line}"/>')
-        parts.append("".join(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="2.5"/>' for x, y in points))
+        parts.append("".join(f'<path class="dot" d="M{x:.1f} {y:.1f}h0"/>' for x, y in points))
     parts.append("</svg>")
-    return "".join(parts) + f'<div class="ends" aria-hidden="true"><span>{escape(first)}</span><span>{escape(second)}</span></div>'
+    # Text in the drawing would be stretched with it.
+    ends = f'<span class="end top-end">{escape(first)} wins</span><span class="end bottom-end">{escape(second)} wins</span>'
+    return f'<div class="chances-box">{"".join(parts)}<div aria-hidden="true">{ends}</div></div>'

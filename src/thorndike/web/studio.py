@@ -75,6 +75,13 @@ class Studio:
         seats, analyst = self._seats(setup)
         place.table.seat(seats, analyst)
 
+    def swap_sides(self, name: str) -> None:
+        """Everybody at a table takes the next seat; the moves stay."""
+        with self._lock:
+            place = self._places[name]
+            place.table.swap_sides()
+            self._places[name] = place._replace(setup=place.setup._replace(person_begins=not place.setup.person_begins))
+
     def place(self, name: str) -> Place | None:
         """A table by its name."""
         with self._lock:

@@ -20,7 +20,7 @@ export default {
             <circle cx="20" cy="20" r="16" /><circle v-if="piece" class="rim" cx="20" cy="20" :r="piece === 'X' ? 11 : 7" /></svg>
           <span v-else-if="piece" class="piece text" :class="owner(piece)" aria-hidden="true">{{ shown(piece) }}</span>
           <span v-if="share(row, column) !== undefined" class="share" aria-hidden="true"
-                :style="{ '--share': share(row, column) }">{{ percent(share(row, column)) }}</span>
+                :style="{ '--share': share(row, column) }">{{ percent(share(row, column)) }}<span class="sign">%</span></span>
         </button>
       </div>
       <div class="board-row names" aria-hidden="true" :style="{ '--row': rows.length - 1 }">
@@ -37,6 +37,7 @@ export default {
     last: Array,
     pending: Array,
     shares: Array,
+    line: Array,
     playable: Boolean,
     side: Number,
   },
@@ -66,6 +67,7 @@ export default {
         empty: !this.rows[row][column],
         last: here(this.last),
         chosen: (this.pending ?? []).some(here),
+        line: (this.line ?? []).some(here),
       };
     },
     owner(piece) {
