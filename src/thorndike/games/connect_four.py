@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
-from thorndike.games.game import Board, Game, Position, Symmetry
+from thorndike.games.game import Board, Game, Position, Square, Symmetry
 
 _ROWS, _COLUMNS = 6, 7
 _LOW_BITS = 28
@@ -92,7 +92,7 @@ def _board(position: ConnectFourPosition) -> Board:
     pieces = ("X", "O") if int(_player(position)) == 0 else ("O", "X")
     rows = tuple(tuple(pieces[0] if mine else pieces[1] if theirs else "" for mine, theirs in row) for row in squares)
     open_columns = np.flatnonzero(np.asarray(_legal(position)) & ~np.asarray(_terminated(position)))
-    clicks = {((row, int(column)),): int(column) for column in open_columns for row in range(_ROWS)}
+    clicks: dict[tuple[Square, ...], int] = {((row, int(column)),): int(column) for column in open_columns for row in range(_ROWS)}
     return Board(rows, tuple("654321"), tuple(_NAMES), clicks, {})
 
 

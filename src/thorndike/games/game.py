@@ -36,6 +36,8 @@ class Board(NamedTuple):
     """The squares clicked one after another -> the legal action that they mean: one to place a piece, two to move one."""
     buttons: Mapping[str, int]
     """Legal actions that are no click on the board, by name: ``pass``."""
+    caption: str = ""
+    """What no square shows: the dice."""
 
 
 class Game(NamedTuple):

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
-from thorndike.games.game import Board, Game, Position, Symmetry
+from thorndike.games.game import Board, Game, Position, Square, Symmetry
 
 _LINES = np.array([0b111, 0b111000, 0b111000000, 0b1001001, 0b10010010, 0b100100100, 0b100010001, 0b1010100], np.uint32)
 _SQUARES = np.arange(9, dtype=np.uint32)
@@ -68,7 +68,7 @@ def _board(position: TicTacToePosition) -> Board:
     pieces = np.asarray(position.pieces)
     marks = ["X" if pieces[0] >> i & 1 else "O" if pieces[1] >> i & 1 else "" for i in range(9)]
     over = bool(_terminated(position))
-    clicks = {((i // 3, i % 3),): i for i in range(9) if marks[i] == "" and not over}
+    clicks: dict[tuple[Square, ...], int] = {((i // 3, i % 3),): i for i in range(9) if marks[i] == "" and not over}
     return Board(tuple(tuple(marks[i : i + 3]) for i in (0, 3, 6)), ("3", "2", "1"), ("a", "b", "c"), clicks, {})
 
 
