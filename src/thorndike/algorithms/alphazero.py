@@ -14,8 +14,9 @@ Deviations from Silver et al.:
 7. Symmetries of the board turn what is learnt from, a minibatch in equal parts, and not what is searched.
 
 Rewards are the mover's: ``rollout/ep_rew_mean`` is the share of games that were won by either. Logs ``train/loss``, ``policy_loss``,
-``value_loss``, ``policy_kl`` (loss less the target's entropy), ``search_value_gain``, ``known_outcomes``, ``grad_norm``, ``learning_rate``
-and, where games are resigned, ``resign_false_positives``. Results: docs/algorithms/alphazero.md.
+``value_loss``, ``policy_kl`` (the loss less the target's entropy), ``known_outcomes``, ``grad_norm``, ``learning_rate`` and, of positions
+in games played on, ``resign_checks``: the share in which the mover would have resigned, ``resign_errors``: and yet did not lose. Results:
+docs/algorithms/alphazero.md.
 """
 
 import math
@@ -29,17 +30,21 @@ from jaxtyping import Array, Float, Int, Key, PyTree
 
 from thorndike.errors import UserError
 from thorndike.functional.guards import accept_if, all_finite
+from thorndike.functional.learning_dynamics import mean_square_gradient
 from thorndike.functional.policy_losses import weighted_mean
 from thorndike.functional.schedules import schedule
 from thorndike.games.game import Game, Position
 from thorndike.games.packing import packing
 from thorndike.games.search import SEARCHES, Evaluate, Found, SearchSettings, search
+from thorndike.games.self_play import Batch, Manners, as_batch, draw_moves, false_resignations, fresh_memory, move, players
 from thorndike.networks.board import TOWERS, board_network, win_value
+from thorndike.networks.hidden_layers import look_into
 from thorndike.networks.masking import FORBIDDEN, MASK
 from thorndike.networks.network import Network
+from thorndike.replay.age import key_to_look_by
 from thorndike.replay.self_play import Rows, SelfPlayBuffer, add_self_play, init_self_play, sample_self_play
 from thorndike.settings import AtLeast, Between, MoreThan, OneOf, check
-from thorndike.types import Algorithm, EnvSpec, Metrics, Needs, Noise, Observation, Rollout, Shared
+from thorndike.types import Algorithm, EnvSpec, Metrics, Needs, Noise, Observation, Rollout
 
 
 @dataclass(frozen=True)
@@ -86,44 +91,22 @@ class State(NamedTuple):
 
     params: PyTree
     average: PyTree
+    """The running average of the parameters: what plays."""
     opt_state: PyTree
     buffer: SelfPlayBuffer
     env_steps: Int[Array, ""]
 
 
-class Batch(NamedTuple):
-    """What the loss needs ``[M, ...]``."""
-
-    board: Float[Array, "M H W C"]
-    legal: Float[Array, "M actions"]
-    policy: Float[Array, "M actions"]
-    policy_weight: Float[Array, " M"]
-    outcome: Float[Array, " M"]
-    value_weight: Float[Array, " M"]
-
-
 def alphazero_loss(params: PyTree, batch: Batch, network: Network, vf_coef: float) -> tuple[Float[Array, ""], Metrics]:
     """Cross-entropy of the search's policy, and of the outcome as the probability of winning: the paper's eq. 1 with deviation 4."""
     logits, win = network.apply(params, batch.board)
-    log_policy = jax.nn.log_softmax(jnp.where(batch.legal > 0, logits, FORBIDDEN))
+    log_policy = jax.nn.log_softmax(jnp.where(batch.legal, logits, FORBIDDEN))
     policy = weighted_mean(-jnp.sum(batch.policy * log_policy, axis=-1), batch.policy_weight)
     value = weighted_mean(optax.sigmoid_binary_cross_entropy(win, 0.5 * (batch.outcome + 1.0)), batch.value_weight)
     entropy = -jnp.sum(batch.policy * jnp.log(jnp.maximum(batch.policy, 1e-9)), axis=-1)
     loss = policy + vf_coef * value
     kl = policy - weighted_mean(entropy, batch.policy_weight)
     return loss, {"train/loss": loss, "train/policy_loss": policy, "train/value_loss": value, "train/policy_kl": kl}
-
-
-def as_batch(game: Game, rows: Rows, symmetries: bool) -> Batch:
-    """Sampled rows as the network sees them; with ``symmetries`` each way to turn the board takes an equal part."""
-    positions = jax.vmap(packing(game).unpack)(rows.position)
-    board, legal = jax.vmap(game.observe)(positions), jax.vmap(game.legal)(positions).astype(jnp.float32)
-    policy, ways = rows.policy, len(game.symmetries) + 1
-    for i, symmetry in enumerate(game.symmetries if symmetries else (), start=1):
-        part = slice(i, None, ways)
-        board = board.at[part].set(jax.vmap(symmetry.observation)(board[part]))
-        policy, legal = (x.at[part].set(x[part][:, symmetry.actions]) for x in (policy, legal))
-    return Batch(board, legal, policy, rows.policy_weight, rows.outcome, rows.known.astype(jnp.float32))
 
 
 def evaluator(game: Game, network: Network) -> Evaluate:
@@ -135,11 +118,6 @@ def evaluator(game: Game, network: Network) -> Evaluate:
         return logits, win_value(win)
 
     return evaluate
-
-
-def false_resignations(extras: PyTree, outcome: Float[Array, "T B"], known: Float[Array, "T B"]) -> Float[Array, ""]:
-    """Of the rows in games played on, in which the mover would have resigned: the share that was not lost."""
-    return weighted_mean((outcome > -1).astype(jnp.float32), (extras["resigns"] & extras["plays_on"]).astype(jnp.float32) * known)
 
 
 def alphazero(config: Config, spec: EnvSpec) -> Algorithm:
@@ -164,6 +142,13 @@ def alphazero(config: Config, spec: EnvSpec) -> Algorithm:
         )
         for simulations in (config.num_simulations, config.fast_simulations, max(config.eval_simulations, 1))
     )
+    manners = Manners(
+        config.temperature,
+        config.temperature_moves,
+        config.resign_threshold,
+        config.resign_check_fraction,
+        config.full_search_fraction,
+    )
     optimizer = optax.chain(
         optax.clip_by_global_norm(config.max_grad_norm),
         optax.scale_by_adam(),
@@ -175,15 +160,6 @@ def alphazero(config: Config, spec: EnvSpec) -> Algorithm:
         params = network.init(key, jnp.zeros((1, *game.observation_shape)))
         buffer = init_self_play(ring, spec.num_envs, whole.size, game.num_actions)
         return State(params, jax.tree.map(jnp.copy, params), optimizer.init(params), buffer, jnp.zeros((), jnp.int32))
-
-    def draw(key: Key[Array, ""], steps: int) -> Noise:
-        key_search, key_full, key_moves, key_on = jax.random.split(key, 4)
-        return {
-            "search": Shared(jax.random.split(key_search, steps)),
-            "full": Shared(jax.random.bernoulli(key_full, config.full_search_fraction, (steps,))),
-            "moves": jax.random.gumbel(key_moves, (steps, spec.num_envs, game.num_actions)),
-            "plays_on": jax.random.bernoulli(key_on, config.resign_check_fraction, (steps, spec.num_envs)),
-        }
 
     def look_ahead(params: PyTree, obs: Observation, noise: Noise) -> Found:
         positions, key = jax.vmap(whole.unpack)(obs["position"]), noise["search"].numbers
@@ -197,19 +173,9 @@ def alphazero(config: Config, spec: EnvSpec) -> Algorithm:
 
     def act(params: PyTree, memory: PyTree, obs: Observation, noise: Noise) -> tuple[PyTree, PyTree, PyTree]:
         found = look_ahead(params, obs, noise)
-        plays_on = jnp.where(memory["moves"] == 0, noise["plays_on"], memory["plays_on"])
-        drawn = jnp.argmax(jnp.log(jnp.maximum(found.policy, 1e-30)) / config.temperature + noise["moves"], axis=-1)
-        action = jnp.where(memory["moves"] < config.temperature_moves, drawn.astype(jnp.int32), found.action)
-        resigns = found.value < config.resign_threshold
-        extras = {
-            "policy": found.policy,
-            "policy_weight": jnp.broadcast_to(noise["full"].numbers.astype(jnp.float32), action.shape),
-            "value": found.value,
-            "resigns": resigns,
-            "plays_on": plays_on,
-        }
-        action = jnp.where(resigns & ~plays_on, game.num_actions, action)
-        return {"moves": memory["moves"] + 1, "plays_on": plays_on}, action, extras
+        moved = move(found, memory, noise, manners)
+        weight = jnp.broadcast_to(noise["full"].numbers.astype(jnp.float32), moved.action.shape)
+        return moved.memory, moved.action, {"policy": found.policy, "policy_weight": weight, "resigns": moved.resigns}
 
     def greedy(params: PyTree, memory: PyTree, obs: Observation, noise: Noise) -> tuple[PyTree, PyTree, PyTree]:
         positions = jax.vmap(whole.unpack)(obs["position"])
@@ -219,20 +185,21 @@ def alphazero(config: Config, spec: EnvSpec) -> Algorithm:
         return memory, search(game, evaluate, strong, params, positions, noise["search"].numbers, explore=False).action, {}
 
     def remember(state: State, rollout: Rollout) -> State:
-        step, extras = rollout.step, rollout.extras
-        players = jax.vmap(jax.vmap(lambda numbers: game.player(whole.unpack(numbers))))(rollout.obs["position"])
+        step, extras, positions = rollout.step, rollout.extras, rollout.obs["position"]
         nothing = jnp.zeros(step.reward.shape)
-        new = Rows(rollout.obs["position"], players, extras["policy"], extras["policy_weight"], nothing, nothing > 0)
+        new = Rows(positions, players(game, positions), extras["policy"], extras["policy_weight"], nothing, nothing > 0, extras["resigns"])
         buffer = add_self_play(state.buffer, new, step.reward, step.done, longest)
         return state._replace(buffer=buffer, env_steps=state.env_steps + rows)
 
     def learn(state: State, key: Key[Array, ""]) -> tuple[State, Metrics]:
-        batch = as_batch(game, sample_self_play(state.buffer, key, config.batch_size), config.symmetries)
+        sampled = sample_self_play(state.buffer, key, config.batch_size)
+        batch = as_batch(game, sampled, config.symmetries)
         (_, metrics), grads = jax.value_and_grad(alphazero_loss, has_aux=True)(state.params, batch, network, config.vf_coef)
         rate = learning_rate(state.env_steps / config.total_steps)
         direction, opt_state = optimizer.update(grads, state.opt_state, state.params)
         metrics |= {"train/grad_norm": optax.global_norm(grads), "train/learning_rate": rate}
         metrics["train/known_outcomes"] = jnp.mean(batch.value_weight)
+        metrics["train/resign_checks"], metrics["train/resign_errors"] = false_resignations(sampled)
         params = jax.tree.map(lambda p, d: p - rate * d, state.params, direction)
         average = jax.tree.map(lambda a, p: a + config.averaging * (p - a), state.average, params)
         sound = all_finite(metrics["train/loss"], metrics["train/grad_norm"])
@@ -242,17 +209,19 @@ def alphazero(config: Config, spec: EnvSpec) -> Algorithm:
     def update(state: State, rollout: Rollout, key: Key[Array, ""]) -> tuple[State, Metrics]:
         state = remember(state, rollout)
         state, metrics = jax.lax.scan(learn, state, jax.random.split(key, config.gradient_steps))
-        metrics = {name: jnp.mean(values) for name, values in metrics.items()}
-        if config.resign_threshold > -1:
-            players = jax.vmap(jax.vmap(lambda numbers: game.player(whole.unpack(numbers))))(rollout.obs["position"])
-            metrics["train/resign_false_positives"] = jnp.zeros(()) * players.sum()
-        return state, metrics
+        return state, {name: jnp.mean(values) for name, values in metrics.items()}
+
+    def dynamics(state: State, rollout: PyTree) -> Metrics:
+        seen = as_batch(game, sample_self_play(state.buffer, key_to_look_by(state.env_steps), config.batch_size), symmetries=False)
+        age = spec.num_envs * (jnp.maximum(state.buffer.size, 1) - 1).astype(jnp.float32) / 2.0
+        looked = look_into(network, state.params, seen.board, mean_square_gradient(state.opt_state))
+        return looked | {"train/replay_age": age}
 
     return Algorithm(
         init=init,
         actor=lambda state: state.average,
-        memory=lambda batch: {"moves": jnp.zeros((batch,), jnp.int32), "plays_on": jnp.zeros((batch,), bool)},
-        draw=draw,
+        memory=fresh_memory,
+        draw=lambda key, steps: draw_moves(key, steps, spec.num_envs, game.num_actions, manners),
         act=act,
         greedy=greedy,
         value=lambda params, obs: win_value(network.apply(params, obs["board"])[1]),
@@ -262,4 +231,5 @@ def alphazero(config: Config, spec: EnvSpec) -> Algorithm:
         probabilities=lambda params, memory, obs: jax.nn.softmax(
             jnp.where(obs[MASK] > 0, network.apply(params, obs["board"])[0], FORBIDDEN)
         ),
+        dynamics=dynamics,
     )

@@ -36,9 +36,7 @@ def observation_space(game: Game) -> gymnasium.spaces.Dict:
     )
 
 
-def game_environment(
-    game: Game, num_envs: int, opening_share: float = OPENING_SHARE, opening_plies: int | None = None
-) -> Environment:
+def game_environment(game: Game, num_envs: int, opening_share: float = OPENING_SHARE, opening_plies: int | None = None) -> Environment:
     """``num_envs`` games side by side, each begun anew when it ends.
 
     Of these ``opening_share`` begin with 0 to ``opening_plies`` random moves (a quarter of the longest game's unless given). Raises

@@ -30,7 +30,7 @@ def packing(game: Game) -> Packing:
 
     def unpack(numbers: Int32[Array, " size"]) -> Position:
         parts = jnp.split(numbers, ends[:-1])
-        return structure.unflatten([_from_numbers(*each) for each in zip(parts, plain, leaves, strict=True)])
+        return jax.tree.unflatten(structure, [_from_numbers(*each) for each in zip(parts, plain, leaves, strict=True)])
 
     return Packing(ends[-1], pack, unpack)
 
@@ -48,4 +48,4 @@ def _from_numbers(numbers: Int32[Array, " n"], plain: jax.ShapeDtypeStruct, leaf
     shaped = numbers.reshape(plain.shape)
     values = jax.lax.bitcast_convert_type(shaped, plain.dtype) if plain.dtype.itemsize == 4 else shaped.astype(plain.dtype)
     is_key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-    return jax.random.wrap_key_data(values, impl=jax.random.key_impl(leaf)) if is_key else values
+    return jax.random.wrap_key_data(values) if is_key else values

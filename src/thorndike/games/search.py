@@ -136,9 +136,7 @@ def _scaled_to_unit(tree: mctx.Tree, node: Int[Array, ""]) -> Float[Array, " act
 
 def _completed(settings: SearchSettings) -> Callable[[mctx.Tree, Int[Array, ""]], Float[Array, " actions"]]:
     def transform(tree: mctx.Tree, node: Int[Array, ""]) -> Float[Array, " actions"]:
-        return mctx.qtransform_completed_by_mix_value(
-            tree, node, value_scale=settings.value_scale, rescale_values=settings.rescale_values
-        )
+        return mctx.qtransform_completed_by_mix_value(tree, node, value_scale=settings.value_scale, rescale_values=settings.rescale_values)
 
     return transform
 

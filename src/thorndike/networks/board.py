@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from thorndike.networks.convolution import Convolution
 from thorndike.networks.dense import dense
+from thorndike.networks.hidden_layers import SHOWN, hidden_layers
 from thorndike.networks.network import Network
 
 TOWERS = ("mlp", "patches", "conv")
@@ -36,20 +37,25 @@ class BoardNetwork(nn.Module):
     def __call__(self, board: Float[Array, "B H W C"]) -> tuple[Float[Array, "B actions"], Float[Array, " B"]]:
         """Board to a policy and a value."""
         x = self._convolutions(board) if self.tower == "conv" else self._dense_layers(board)
-        value = nn.relu(dense(64, _hidden_init, name="value_hidden")(x))
+        value = self._shown(dense(64, _hidden_init, name="value_hidden")(x))
         return dense(self.actions, _small_init, name="policy")(x), dense(1, _small_init, name="value")(value)[..., 0]
+
+    def _shown(self, x: Float[Array, "*B F"]) -> Float[Array, "*B F"]:
+        activated = nn.relu(x)
+        self.sow(SHOWN, "relu", activated)
+        return activated
 
     def _dense_layers(self, board: Float[Array, "B H W C"]) -> Float[Array, "B F"]:
         flat = board.reshape((board.shape[0], -1))
         if self.tower == "patches":
             size = min(self.patch_size, *board.shape[1:3])
-            seen = nn.relu(Convolution(self.patch_channels, size, 1, _hidden_init, name="patches")(board))
+            seen = self._shown(Convolution(self.patch_channels, size, 1, _hidden_init, name="patches")(board))
             flat = jnp.concatenate([flat, seen.reshape((board.shape[0], -1))], axis=-1)
         x = dense(self.width, _hidden_init, name="first")(flat)
         for block in range(self.blocks):
-            inner = nn.relu(dense(self.width, _hidden_init, name=f"block_{block}_a")(nn.relu(x)))
+            inner = self._shown(dense(self.width, _hidden_init, name=f"block_{block}_a")(self._shown(x)))
             x = x + dense(self.width, _small_init, name=f"block_{block}_b")(inner)
-        return nn.relu(x)
+        return self._shown(x)
 
     def _convolutions(self, board: Float[Array, "B H W C"]) -> Float[Array, "B F"]:
         def convolution(name: str, init: Callable[..., Array]) -> Convolution:
@@ -57,9 +63,9 @@ class BoardNetwork(nn.Module):
 
         x = convolution("first", _hidden_init)(board)
         for block in range(self.blocks):
-            inner = nn.relu(convolution(f"block_{block}_a", _hidden_init)(nn.relu(x)))
+            inner = self._shown(convolution(f"block_{block}_a", _hidden_init)(self._shown(x)))
             x = x + convolution(f"block_{block}_b", _small_init)(inner)
-        return nn.relu(dense(self.width, _hidden_init, name="last")(nn.relu(x).reshape((board.shape[0], -1))))
+        return self._shown(dense(self.width, _hidden_init, name="last")(self._shown(x).reshape((board.shape[0], -1))))
 
 
 def board_network(actions: int, tower: str, width: int, blocks: int) -> Network:
@@ -68,6 +74,7 @@ def board_network(actions: int, tower: str, width: int, blocks: int) -> Network:
     return Network(
         init=lambda key, board: module.init(key, board)["params"],
         apply=lambda params, board: module.apply({"params": params}, board),
+        layers=hidden_layers(module),
     )
 
 

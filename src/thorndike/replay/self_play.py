@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int, Int8, Int32, Key
 
 
 class Rows(NamedTuple):
-    """Positions in which somebody moved ``[..., ]``."""
+    """Positions in which somebody moved, with any leading axes."""
 
     position: Int32[Array, "*rows words"]
     """Packed."""
@@ -25,6 +25,8 @@ class Rows(NamedTuple):
     """What the game earned the player who was to move."""
     known: Bool[Array, "*rows"]
     """Whether the outcome is known."""
+    resigns: Bool[Array, "*rows"]
+    """Whether the mover would have resigned a game that was played on."""
 
 
 class SelfPlayBuffer(NamedTuple):
@@ -47,13 +49,12 @@ def init_self_play(steps: int, games: int, words: int, actions: int) -> SelfPlay
         policy_weight=jnp.zeros(lead, jnp.float32),
         outcome=jnp.zeros(lead, jnp.float32),
         known=jnp.zeros(lead, bool),
+        resigns=jnp.zeros(lead, bool),
     )
     return SelfPlayBuffer(rows, jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32))
 
 
-def add_self_play(
-    buffer: SelfPlayBuffer, new: Rows, reward: Float[Array, "T B"], done: Bool[Array, "T B"], longest: int
-) -> SelfPlayBuffer:
+def add_self_play(buffer: SelfPlayBuffer, new: Rows, reward: Float[Array, "T B"], done: Bool[Array, "T B"], longest: int) -> SelfPlayBuffer:
     """Write ``T`` steps over the oldest ones and tell the outcomes of the games that ended to all their rows.
 
     ``reward`` is what each step's mover earned by it, ``longest`` how many steps a game can have. ``N`` must be a multiple of ``T`` and at
