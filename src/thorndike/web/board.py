@@ -63,6 +63,7 @@ class _BoardPage:
         self._board = BoardElement()
         self._board.props["name"] = f"{self._look.title}, board: arrow keys move, Enter plays"
         self._board.on("square", self._click)
+        self._board.on("press", self._press)
         self._buttons = Tag("div", "actions", "", {"role": "group", "aria-label": "Moves that are no squares"})
         with Tag("div", "actions", "", {"role": "group", "aria-label": "Game"}):
             self._stop = button("Stop thinking", self._doing(lambda: self._table.interrupt()), "primary")
@@ -87,9 +88,19 @@ class _BoardPage:
             self._list = Tag("ol", "moves")
             with Tag("div", "replay", "", {"role": "group", "aria-label": "Step through the game"}):
                 button("«", self._step(lambda view: 0), "icon", {"aria-label": "To the beginning"})
-                button("‹", self._step(lambda view: view.shown - 1), "icon", {"aria-label": "One move back"})
+                button(
+                    "\N{SINGLE LEFT-POINTING ANGLE QUOTATION MARK}",
+                    self._step(lambda view: view.shown - 1),
+                    "icon",
+                    {"aria-label": "One move back"},
+                )
                 self._slider = slider("Position: arrow keys step through the game", self._slide)
-                button("›", self._step(lambda view: view.shown + 1), "icon", {"aria-label": "One move on"})
+                button(
+                    "\N{SINGLE RIGHT-POINTING ANGLE QUOTATION MARK}",
+                    self._step(lambda view: view.shown + 1),
+                    "icon",
+                    {"aria-label": "One move on"},
+                )
                 button("»", self._step(lambda view: len(view.moves)), "icon", {"aria-label": "To the last move"})
         with Tag("details", "panel"):
             Tag("summary", "", "Change the opponent")
@@ -188,6 +199,10 @@ class _BoardPage:
         match said.args:
             case [int(row), int(column)]:
                 await self._notice.doing(lambda: self._table.click((row, column)))
+
+    async def _press(self, said: events.GenericEventArguments) -> None:
+        if isinstance(said.args, str):
+            await self._notice.doing(partial(self._table.press, said.args))
 
     async def _slide(self, value: str) -> None:
         if value.isdecimal():

@@ -60,11 +60,16 @@ def add_home(studio: Studio) -> None:
                 form = SetupForm(studio, Setup(game_id, studio.opponents(game_id)[0].id))
 
                 async def start() -> None:
+                    # Games of pgx take some seconds to compile.
+                    start_button.set_text("Setting up the board…")
+                    start_button.set_attribute("disabled", True)
                     name = await notice.doing(lambda: studio.open(form.setup))
+                    start_button.set_text("Start")
+                    start_button.set_attribute("disabled", None)
                     if name is not None:
                         ui.navigate.to(f"/play/{name}")
 
-                button("Start", start, "primary")
+                start_button = button("Start", start, "primary")
 
 
 def _being_played(studio: Studio) -> dict[str, str]:

@@ -26,7 +26,8 @@ _DRAWINGS: Mapping[str, str] = MappingProxyType(
         '<circle cx="13" cy="13" r="8" fill="#fafafa"/><circle cx="35" cy="35" r="8" fill="#fafafa"/>'
         '<circle cx="35" cy="13" r="8" fill="#161616"/><circle cx="13" cy="35" r="8" fill="#161616"/>',
         "go": f'<rect x="2" y="2" width="44" height="44" rx="6" fill="var(--wood)"/>{_GRID}'
-        '<circle cx="16" cy="24" r="5" fill="#161616"/><circle cx="32" cy="24" r="5" fill="#fafafa"/><circle cx="24" cy="16" r="5" fill="#161616"/>',
+        '<circle cx="16" cy="24" r="5" fill="#161616"/><circle cx="32" cy="24" r="5" fill="#fafafa"/>'
+        '<circle cx="24" cy="16" r="5" fill="#161616"/>',
         "hex": _HEXES,
         "chess": f'<rect x="4" y="4" width="40" height="40" fill="var(--light-square)"/><g fill="var(--dark-square)">{_CHESS}</g>'
         '<circle cx="29" cy="19" r="4" fill="#1a1a1a"/><circle cx="19" cy="29" r="4" fill="#fff" stroke="#1a1a1a"/>',

@@ -1,6 +1,7 @@
 """Whom one can play against, by game."""
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
 from thorndike.games.game import Game, Player
@@ -27,3 +28,12 @@ Opponents: TypeAlias = Callable[[str], Sequence[Opponent]]
 """A game's id -> who plays it."""
 
 ANOTHER_PERSON = Opponent(PERSON, "Another person, here", None)
+
+
+def opponents_in(output: Path) -> Opponents:
+    """Those that are always there, and what was trained in a folder of runs."""
+
+    def opponents(game_id: str) -> Sequence[Opponent]:
+        return ()
+
+    return opponents

@@ -50,6 +50,7 @@ def picture(game: Game, view: View) -> Picture:
             "pending": view.pending,
             "shares": [[*square, share] for square, share in shares.items()],
             "playable": _is_persons_turn(view),
+            "arrows": not ply.board.clicks and any(name in ply.board.buttons for name in ("left", "right", "up", "down")),
             "side": ply.player,
         },
         probabilities=probabilities,

@@ -39,9 +39,10 @@ export default {
     shares: Array,
     line: Array,
     playable: Boolean,
+    arrows: Boolean, // whether arrow keys are the moves of this game
     side: Number,
   },
-  emits: ["square"],
+  emits: ["square", "press"],
   data() {
     return { at: [Math.floor(this.rows.length / 2), Math.floor(this.rows[0].length / 2)] };
   },
@@ -91,6 +92,7 @@ export default {
       if (event.key === "Escape" && this.pending?.length) this.$emit("square", this.pending[this.pending.length - 1]);
       if (!to || event.altKey || event.ctrlKey || event.metaKey) return;
       event.preventDefault();
+      if (this.arrows && event.key.startsWith("Arrow")) return this.$emit("press", event.key.slice(5).toLowerCase());
       this.at = to;
       this.$el.querySelector(`[data-square="${to[0]},${to[1]}"]`).focus();
     },
