@@ -1,0 +1,67 @@
+"""Positions of a game one after another, each with what people ask about it."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from thorndike.games.game import Board, Game, Position, Square
+
+
+class Ply(NamedTuple):
+    """A position of the game, and what led there and is allowed there."""
+
+    position: Position
+    number: int
+    """Moves before it."""
+    board: Board
+    legal: tuple[int, ...]
+    """In order; empty when the game is over."""
+    player: int
+    rewards: tuple[float, ...]
+    """Earned by the move that led here."""
+
+
+def first_ply(game: Game, seed: int) -> Ply:
+    """The beginning; ``seed`` throws the dice."""
+    return _ply(game, game.init(jax.random.key(seed)), 0, (0.0,) * game.num_players)
+
+
+def next_ply(game: Game, ply: Ply, action: int, seed: int) -> Ply:
+    """What a legal move leads to."""
+    position = jax.jit(game.step)(ply.position, jnp.int32(action), jax.random.fold_in(jax.random.key(seed), ply.number))
+    return _ply(game, position, ply.number + 1, tuple(map(float, np.asarray(jax.jit(game.rewards)(position)))))
+
+
+def _ply(game: Game, position: Position, number: int, rewards: tuple[float, ...]) -> Ply:
+    over = bool(jax.jit(game.terminated)(position))
+    legal = () if over else tuple(map(int, np.flatnonzero(np.asarray(jax.jit(game.legal)(position)))))
+    return Ply(position, number, game.board(position), legal, int(jax.jit(game.player)(position)), rewards)
+
+
+def target_square(game: Game, ply: Ply, action: int) -> Square | None:
+    """Where a legal move puts something; None for one that is no click on the board."""
+    clicked = [squares for squares, of in ply.board.clicks.items() if of == action]
+    if not clicked:
+        return None
+    if len(clicked) == 1:
+        return clicked[0][-1]
+    # Many squares mean this move, as those of a column do: it is the one on which something appears.
+    after = next_ply(game, ply, action, seed=0).board.rows
+    changed = (
+        squares[-1] for squares in clicked if after[squares[-1][0]][squares[-1][1]] != ply.board.rows[squares[-1][0]][squares[-1][1]]
+    )
+    return next(changed, clicked[0][-1])
+
+
+def line_names(game: Game, ply: Ply, actions: Sequence[int], at_most: int) -> tuple[str, ...]:
+    """The names of moves played one after another, as far as they are legal."""
+    names: list[str] = []
+    for action in actions[:at_most]:
+        if action not in ply.legal:
+            break
+        names.append(game.action_name(ply.position, action))
+        ply = next_ply(game, ply, action, seed=0)
+    return tuple(names)
