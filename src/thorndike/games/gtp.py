@@ -5,6 +5,7 @@ import time
 from thorndike.games.engine_player import Answered, Dialogue, Start, started
 from thorndike.games.engine_process import EngineFailure, EngineProcess
 from thorndike.games.game import Turn
+from thorndike.games.plies import MoveNames
 
 _COLOURS = ("black", "white")
 _PATIENCE_S = 10.0
@@ -15,6 +16,7 @@ def gtp_start(command: tuple[str, ...], size: int, komi: float | None, move_limi
     """How to start an engine on boards of ``size``; it is given up on if a move takes longer than ``move_limit_s``."""
 
     def start() -> Dialogue:
+        names = MoveNames()
         known: list[int] = []
         """The actions that the engine has played on its board."""
 
@@ -30,11 +32,9 @@ def gtp_start(command: tuple[str, ...], size: int, komi: float | None, move_limi
             if list(turn.moves[: len(known)]) != known:
                 begin(process)
                 known.clear()
-            # Who plays which move, and its name, depend on the position it was played in.
-            if len(known) < len(turn.moves):
-                for ply, (colour, name) in enumerate(named_moves(turn)):
-                    if ply >= len(known) and (passes_are_told or name != "pass"):
-                        told(process, f"play {colour} {name}")
+            for player, name in names(turn)[len(known) :]:
+                if passes_are_told or name != "pass":
+                    told(process, f"play {_COLOURS[player]} {name}")
             known[:] = turn.moves
 
         def ask(turn: Turn) -> Answered:
@@ -49,18 +49,6 @@ def gtp_start(command: tuple[str, ...], size: int, komi: float | None, move_limi
         return Dialogue(ask, process.close)
 
     return start
-
-
-def named_moves(turn: Turn) -> list[tuple[str, str]]:
-    """Colour and name of each move so far."""
-    import jax
-
-    game, key = turn.game, jax.random.key(0)
-    position, found = game.init(key), []
-    for action in turn.moves:
-        found.append((_COLOURS[int(game.player(position))], game.action_name(position, action)))
-        position = game.step(position, jax.numpy.int32(action), key)
-    return found
 
 
 def told(process: EngineProcess, command: str, limit_s: float = _PATIENCE_S) -> str:
