@@ -10,12 +10,13 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PYGAME_HIDE_SUPPORT_PROMPT := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-slow bench format clean
+.PHONY: help install demo test test-slow opponents bench format clean
 
 help:
 	@echo "make demo       train PPO on CartPole-v1 with 8 seeds, evaluate, plot and film it"
 	@echo "make test       linter, formatter check, type checker, tests"
 	@echo "make test-slow  the learning tests that take long"
+	@echo "make opponents  install what agents are measured against into .venv-opponents"
 	@echo "make bench      measure against other libraries, write docs/performance.md"
 	@echo "make format     format the code and mend what the linter can"
 	@echo "make clean      remove .venv, caches and build files (runs/ stays)"
@@ -61,6 +62,14 @@ test-slow: $(STAMP)
 	.venv-peers/bin/python -m pip install --quiet torch==2.13.0+cpu || .venv-peers/bin/python -m pip install --quiet torch==2.13.0
 	grep -v '^torch==' benchmarks/peers.txt > .venv-peers/peers.txt
 	.venv-peers/bin/python -m pip install --quiet -r .venv-peers/peers.txt
+	@touch $@
+
+# Programs that nobody here wrote, to play against; each runs in a process of its own.
+opponents: .venv-opponents/.installed
+
+.venv-opponents/.installed: benchmarks/opponents.txt
+	$(PYTHON) -m venv .venv-opponents
+	.venv-opponents/bin/python -m pip install --quiet -r benchmarks/opponents.txt
 	@touch $@
 
 bench: $(STAMP) .venv-peers/.installed
