@@ -5,7 +5,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
 
-from nicegui import app, run, ui
+from nicegui import app, context, run, ui
 
 from thorndike.errors import UserError
 from thorndike.web.controls import Tag, link
@@ -25,6 +25,10 @@ def frame(title: str) -> Iterator["Notice"]:
     """A page with the heading of the studio; what is made inside is its content. Gives the line where mistakes are told."""
     ui.page_title(f"{title} · Thorndike")
     ui.add_head_html(f'<link rel="stylesheet" href="{_AT}/studio.css"><meta name="color-scheme" content="light dark">')
+    # Quasar makes all of the page the main part, its heading too.
+    around = context.client.content.parent_slot
+    assert around is not None
+    around.parent.props["role"] = "none"
     with Tag("header", "top"):
         link("Thorndike", "/", "brand").props('aria-label="Thorndike, the studio: home"')
         with Tag("nav", "", "", {"aria-label": "Pages"}):
