@@ -143,7 +143,7 @@ def test_a_wrong_name_gets_the_nearest(id: str) -> None:
         game("nowhere.py:GAME")
     module, attribute = OWN_GAMES[id].split(":")
     assert game(f"{module}:{attribute}") is game(id)
-    with pytest.raises(UserError, match=f"no game '{attribute[:-1]}' there; did you mean '{attribute}'"):
+    with pytest.raises(UserError, match=f"there is no such game; did you mean '{attribute}'"):
         game(f"{module}:{attribute[:-1]}")
     with pytest.raises(UserError, match=r"must be a thorndike\.games\.game\.Game"):
         game("math:pi")

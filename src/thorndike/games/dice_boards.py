@@ -57,7 +57,7 @@ def _backgammon_board(position: Position, legal: Sequence[int]) -> Board:
     buttons = {}
     for action in sorted(legal, key=lambda action: _ends(position, action)[2]):
         start, end, _ = _ends(position, action)
-        click = (square(start), square(end)) if action >= 6 else ()
+        click = (square(start), square(end))
         if action < 6 or click in clicks:
             buttons[_backgammon_name(position, action)] = action
         else:

@@ -1,7 +1,7 @@
 """A game that plays itself, as a compiled batch of environments: whoever is to move acts, and is rewarded by what the move earned.
 
 A share of the games begins with a few random moves, for a learner that only meets its own games knows nothing of others
-(``opening_share``, ``opening_plies``). An action beyond the game's own means that the mover resigns.
+(``opening_share``, ``opening_plies``; see ``settings.py``). An action beyond the game's own means that the mover resigns.
 """
 
 import gymnasium
@@ -14,12 +14,12 @@ from jaxtyping import Array, Float, Int, Key
 from thorndike.errors import UserError
 from thorndike.games.game import Game, Position
 from thorndike.games.packing import packing
+from thorndike.games.settings import GameSettings
 from thorndike.networks.masking import FORBIDDEN, MASK
 from thorndike.types import Action, Environment, EnvSpec, Noise, Observation, Shared, Step
 
 BOARD, POSITION = "board", "position"
-OPENING_SHARE = 0.7
-"""Of the games, where nobody says otherwise."""
+SELF_PLAY = GameSettings()
 _POOL = 8
 """Games of a batch that share one opening, where they begin at the same step."""
 
@@ -36,37 +36,32 @@ def observation_space(game: Game) -> gymnasium.spaces.Dict:
     )
 
 
-def game_environment(game: Game, num_envs: int, opening_share: float = OPENING_SHARE, opening_plies: int | None = None) -> Environment:
-    """``num_envs`` games side by side, each begun anew when it ends.
+def observed_position(game: Game, position: Position) -> Observation:
+    """One position as an observation."""
+    return {
+        BOARD: game.observe(position),
+        MASK: game.legal(position).astype(jnp.int8),
+        POSITION: packing(game).pack(position),
+    }
 
-    Of these ``opening_share`` begin with 0 to ``opening_plies`` random moves (a quarter of the longest game's unless given). Raises
-    ``UserError`` for settings that cannot be, and games of one player.
-    """
-    plies = game.max_moves // 4 if opening_plies is None else opening_plies
-    if not 0 <= opening_share <= 1 or not 0 <= plies < game.max_moves:
-        raise UserError(
-            f"{game.id}: opening_share is from 0 to 1 and opening_plies from 0 to {game.max_moves - 1}, not {opening_share} and {plies}"
-        )
+
+def game_environment(game: Game, num_envs: int, settings: GameSettings = SELF_PLAY) -> Environment:
+    """``num_envs`` games side by side, each begun anew when it ends, as ``settings`` say. Raises ``UserError`` if there are none."""
+    share, plies = settings.opening_share, game.max_moves // 4 if settings.opening_plies is None else settings.opening_plies
     if num_envs < 1:
         raise UserError(f"num_envs of {game.id} must be at least 1, not {num_envs}: give a larger number")
     pool = -(-num_envs // _POOL)
-    whole = packing(game)
 
-    def observe(positions: Position) -> Observation:
-        return {
-            BOARD: jax.vmap(game.observe)(positions),
-            MASK: jax.vmap(game.legal)(positions).astype(jnp.int8),
-            POSITION: jax.vmap(whole.pack)(positions),
-        }
+    observe = jax.vmap(lambda position: observed_position(game, position))
 
     def begin(key: Key[Array, ""]) -> Position:
         keys = jax.random.split(key, pool)
-        openings = jax.vmap(lambda key: opening(game, key, opening_share, plies))(keys)
+        openings = jax.vmap(lambda key: opening(game, key, share, plies))(keys)
         return jax.tree.map(lambda x: jnp.tile(x, (_POOL,) + (1,) * (x.ndim - 1))[:num_envs], openings)
 
     def init(key: Key[Array, ""]) -> tuple[Position, Observation]:
         keys = jax.random.split(key, num_envs)
-        positions = jax.vmap(lambda key: opening(game, key, opening_share, plies))(keys)
+        positions = jax.vmap(lambda key: opening(game, key, share, plies))(keys)
         return positions, observe(positions)
 
     def draw(key: Key[Array, ""], steps: int) -> Noise:

@@ -86,6 +86,8 @@ class Choice(NamedTuple):
     principal_variation: tuple[int, ...] = ()
     """The line that the player expects, beginning with ``action``."""
     resigns: bool = False
+    remark: str = ""
+    """What people should know: why it resigns, that it broke a rule."""
 
 
 class Turn(NamedTuple):

@@ -51,6 +51,9 @@ _HAS_CHANCE = ("backgammon", "2048")
 _KEEPS_LEGAL = ("chess", "shogi")
 """Games whose rules keep the legal actions once more, in ``_x``."""
 
+_DOUBLES = {"backgammon": (1, 2, 3, 4, 5)}
+"""Actions that do the same as another one: backgammon passes by any of six."""
+
 
 def _as_pgx_is_written() -> AbstractContextManager[None]:
     """pgx broadcasts between ranks, which the tests do not allow us."""
@@ -61,11 +64,15 @@ def _as_pgx_is_written() -> AbstractContextManager[None]:
 def pgx_game(id: str) -> Game:
     """The game of a pgx id. Raises UserError where pgx is missing or of an untested version."""
     check_version()
-    import pgx
-
-    env = pgx.make(id)
     module, attribute = FACES[id]
-    face: Face = getattr(importlib.import_module(module), attribute)
+    with _as_pgx_is_written():
+        import pgx
+
+        env = pgx.make(id)
+        face: Face = getattr(importlib.import_module(module), attribute)
+        # `env.num_actions` would run it.
+        num_actions = jax.eval_shape(env._init, jax.random.key(0)).legal_action_mask.shape[0]
+    singles = np.isin(np.arange(num_actions), _DOUBLES.get(id, ()), invert=True)
 
     def light(state: Position) -> Position:
         """Without what can be computed again, and with types that a loop can carry."""
@@ -84,7 +91,8 @@ def pgx_game(id: str) -> Game:
             return light(env._step(position.replace(_step_count=position._step_count + 1), action, key))
 
     def legal(position: Position) -> Bool[Array, " actions"]:
-        return position._x.legal_action_mask if id in _KEEPS_LEGAL else position.legal_action_mask
+        mask = position._x.legal_action_mask if id in _KEEPS_LEGAL else position.legal_action_mask
+        return mask & singles
 
     def observe(position: Position) -> Float[Array, "height width channels"]:
         with _as_pgx_is_written():
@@ -99,7 +107,7 @@ def pgx_game(id: str) -> Game:
     shape = jax.eval_shape(lambda key: observe(init(key)), jax.random.key(0)).shape
     return Game(
         id=id,
-        num_actions=env.num_actions,
+        num_actions=num_actions,
         observation_shape=shape,
         max_moves=LONGEST[id],
         init=init,

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from thorndike.games.game import Board, Game, Position, Square
+from thorndike.games.game import Board, Game, Position, Square, Turn
 
 
 class Ply(NamedTuple):
@@ -65,3 +65,24 @@ def line_names(game: Game, ply: Ply, actions: Sequence[int], at_most: int) -> tu
         names.append(game.action_name(ply.position, action))
         ply = next_ply(game, ply, action, seed=0)
     return tuple(names)
+
+
+class MoveNames:
+    """Who played what, by name, of one game after another: what is known of the moves so far is kept for the next question."""
+
+    def __init__(self) -> None:
+        """Nothing is known yet."""
+        self._moves: list[int] = []
+        self._names: list[tuple[int, str]] = []
+        self._position: Position = None
+
+    def __call__(self, turn: Turn) -> list[tuple[int, str]]:
+        """Player and name of each move of a game without dice."""
+        game, key = turn.game, jax.random.key(0)
+        if self._position is None or list(turn.moves[: len(self._moves)]) != self._moves:
+            self._moves, self._names, self._position = [], [], game.init(key)
+        for action in turn.moves[len(self._moves) :]:
+            self._names.append((int(jax.jit(game.player)(self._position)), game.action_name(self._position, action)))
+            self._moves.append(action)
+            self._position = jax.jit(game.step)(self._position, jnp.int32(action), key)
+        return list(self._names)

@@ -4,9 +4,10 @@ Nothing heavy is imported before a game is made: a wrong name is answered at onc
 """
 
 import importlib
+import sys
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from thorndike.errors import UserError
 from thorndike.suggestions import did_you_mean
@@ -37,8 +38,15 @@ def game_ids() -> tuple[str, ...]:
     return (*OWN_GAMES, *ADAPTED_GAMES)
 
 
+def is_game(name: str) -> bool:
+    """Whether ``game(name)`` finds one. Code of the user's is imported for it, for nothing else tells."""
+    if name in OWN_GAMES or name in ADAPTED_GAMES:
+        return True
+    return ":" in name and _is_instance(_named(name)[0])
+
+
 def game(name: str) -> "Game":
-    """The game of an id, ``module:attribute`` or ``path/to/file.py:attribute`` (a ``Game``, or a function that makes one).
+    """The game of an id, or the ``Game`` that ``module:attribute`` or ``path/to/file.py:attribute`` names.
 
     Raises UserError in one line for a name that is not known, with the nearest known one.
     """
@@ -50,20 +58,23 @@ def game(name: str) -> "Game":
         return getattr(importlib.import_module(module), attribute)(name)
     if ":" not in name:
         raise UserError(f"unknown game {name!r}{did_you_mean(name, game_ids())}")
-    return _of_the_user(name)
+    found, others = _named(name)
+    if found is None:
+        raise UserError(f"{name}: there is no such game{did_you_mean(name.rpartition(':')[2], others)}")
+    if not _is_instance(found):
+        raise UserError(f"{name} must be a thorndike.games.game.Game, not {type(found).__name__}")
+    return cast("Game", found)
 
 
-def _of_the_user(name: str) -> "Game":
-    from thorndike.games.game import Game
-
+def _named(name: str) -> tuple[object, list[str]]:
+    """What ``module:attribute`` or ``path/to/file.py:attribute`` names, None if there is no such thing, and the games that are there."""
     in_file = attribute_in_file(name)
     module_name, _, attribute = name.rpartition(":")
     module = import_module(module_name, name, _FORMS) if in_file is None else load_file(in_file[0], "the game")
-    found = getattr(module, attribute, None)
-    if found is None:
-        games = [key for key, value in vars(module).items() if isinstance(value, Game)]
-        raise UserError(f"{name}: no game {attribute!r} there{did_you_mean(attribute, games)}")
-    made = found if isinstance(found, Game) or not callable(found) else found()
-    if not isinstance(made, Game):
-        raise UserError(f"{name} must be a thorndike.games.game.Game, or a function that makes one, not {type(made).__name__}")
-    return made
+    return getattr(module, attribute, None), [key for key, value in vars(module).items() if _is_instance(value)]
+
+
+def _is_instance(value: object) -> bool:
+    """Whether it is a ``Game``. Who made one has imported what a game is, and JAX."""
+    made = sys.modules.get("thorndike.games.game")
+    return made is not None and isinstance(value, made.Game)
