@@ -47,8 +47,8 @@ def _gnugo(program: tuple[str, ...], game: str, settings: Settings, limit_s: flo
 
     command = [*program, "--mode", "gtp", "--chinese-rules", "--positional-superko", "--level", str(settings.get("level", 10))]
     command += ["--seed", str(settings["seed"])] if "seed" in settings else []
-    # The komi and the way to count of pgx's Go.
-    return gtp_start(tuple(command), int(game.split("x")[-1]), 7.5, limit_s)
+    # The komi and the way to count of pgx's Go: what is not captured lives, so GNU Go is not to pass before it has cleaned up.
+    return gtp_start(tuple(command), int(game.split("x")[-1]), 7.5, limit_s, generate="kgs-genmove_cleanup")
 
 
 def _rhino(program: tuple[str, ...], game: str, settings: Settings, limit_s: float) -> "Start":

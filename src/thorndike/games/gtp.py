@@ -12,8 +12,18 @@ _PATIENCE_S = 10.0
 """For everything but a move."""
 
 
-def gtp_start(command: tuple[str, ...], size: int, komi: float | None, move_limit_s: float, passes_are_told: bool = True) -> Start:
-    """How to start an engine on boards of ``size``; it is given up on if a move takes longer than ``move_limit_s``."""
+def gtp_start(
+    command: tuple[str, ...],
+    size: int,
+    komi: float | None,
+    move_limit_s: float,
+    passes_are_told: bool = True,
+    generate: str = "genmove",
+) -> Start:
+    """How to start an engine on boards of ``size``; it is given up on if a move takes longer than ``move_limit_s``.
+
+    ``generate`` is what it is asked for a move with.
+    """
 
     def start() -> Dialogue:
         names = MoveNames()
@@ -41,7 +51,7 @@ def gtp_start(command: tuple[str, ...], size: int, komi: float | None, move_limi
             catch_up(turn)
             colour = _COLOURS[int(turn.game.player(turn.position))]
             # It plays its move on its board too, which we take back: the match decides what is played.
-            move = told(process, f"genmove {colour}", move_limit_s)
+            move = told(process, f"{generate} {colour}", move_limit_s)
             if move.lower() != "resign":
                 told(process, "undo")
             return Answered(move)
