@@ -21,8 +21,8 @@ def serve_static_files() -> None:
 
 
 @contextmanager
-def frame(title: str) -> Iterator["Notice"]:
-    """A page with the heading of the studio; what is made inside is its content. Gives the line where mistakes are told."""
+def frame(title: str) -> Iterator[None]:
+    """A page with the heading of the studio; what is made inside is its content."""
     ui.page_title(f"{title} · Thorndike")
     ui.add_head_html(f'<link rel="stylesheet" href="{_AT}/studio.css"><meta name="color-scheme" content="light dark">')
     # Quasar makes all of the page the main part, its heading too.
@@ -34,11 +34,11 @@ def frame(title: str) -> Iterator["Notice"]:
         with Tag("nav", "", "", {"aria-label": "Pages"}):
             link("Games", "/")
     with Tag("main", "page"):
-        yield Notice()
+        yield
 
 
 class Notice:
-    """One line that says what went wrong, and is spoken at once."""
+    """One line, where it is made, that says what went wrong and is spoken at once."""
 
     def __init__(self) -> None:
         self._line = Tag("p", "notice", "", {"role": "alert"})
