@@ -65,7 +65,7 @@ def check_any(compiled):
     random = np.random.default_rng(4)
     for number in range(2):
         for ply, (position, action) in enumerate(random_moves(random, compiled, 200 if made.id == "go_19x19" else 800)):
-            legal, player, over, rewards = compiled.facts(position)
+            _, player, over, rewards = compiled.facts(position)
             if ply == 0:
                 assert player == 0
                 assert not over

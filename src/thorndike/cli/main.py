@@ -33,6 +33,8 @@ VERBS: dict[str, Verb] = {
     "sweep": Verb("thorndike.cli.sweep", "ALGORITHM ENVIRONMENT", "search settings, say which matter, rerun the best on fresh seeds"),
     "compare": Verb("thorndike.cli.compare", "RUN RUN...", "say which run is better, worse, or that nobody can tell yet"),
     "studio": Verb("thorndike.cli.studio", "", "play games in the browser, on this machine"),
+    "arena": Verb("thorndike.cli.arena", "GAME PLAYER PLAYER...", "let agents and programs play each other, and rate them"),
+    "play": Verb("thorndike.cli.play", "GAME", "play a game against an agent or a program, here in the terminal"),
     "check-env": Verb("thorndike.cli.check_env", "ENVIRONMENT", "say what is wrong with an environment, with fixes"),
     "list": Verb("thorndike.cli.list", "[WHAT]", "list runs, algorithms, environments, presets or settings"),
     "show": Verb("thorndike.cli.show", "RUN", "show a run's settings, state and last results"),

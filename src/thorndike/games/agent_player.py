@@ -30,8 +30,8 @@ def agent_player(
 ) -> Player:
     """``actor`` and ``statistics`` are of one seed; ``config`` is what it was trained with, of which the search's settings are taken.
 
-    With 0 simulations, and in games that are not searched (dice, one player), the network's likeliest move is played. Raises UserError for an
-    algorithm whose policy does not tell probabilities of moves.
+    With 0 simulations, and in games that are not searched (dice, one player), the network's likeliest move is played. Raises UserError for
+    an algorithm whose policy does not tell probabilities of moves.
     """
     if algorithm.probabilities is None:
         raise UserError(f"{name} tells no probabilities of moves, so it cannot play here: train it with alphazero, or with ppo")
@@ -75,6 +75,6 @@ def _evaluation(game: Game, algorithm: Algorithm, probabilities: Callable, wrapp
 
 def _settings(config: Mapping[str, object], simulations: int) -> SearchSettings:
     """Those that the policy was trained with, by the names of ``SearchSettings``; ``search`` is the kind."""
-    known = {name: config[name] for name in SearchSettings._fields if name in config}
-    known |= {"kind": config["search"]} if "search" in config else {}
-    return SearchSettings()._replace(**known)._replace(simulations=simulations)
+    values = SearchSettings()._asdict()
+    values |= {name: config[name] for name in values if name in config}
+    return SearchSettings(**values | {"kind": config.get("search", values["kind"]), "simulations": simulations})

@@ -1,13 +1,13 @@
 """The games of pgx (Koyama et al. 2023, arXiv:2303.17503) as games of ours: the rules are pgx's, boards and names of moves are added.
 
-pgx draws which player id moves first, and computes an observation and checks for illegal actions at every step. Here player 0 moves first, a
-position carries no observation (nor a second copy of its legal actions), and neither is computed where nobody asks. That reaches into pgx,
-so only the tested versions are taken.
+pgx draws which player id moves first, and computes an observation and checks for illegal actions at every step. Here player 0 moves first,
+a position carries no observation (nor a second copy of its legal actions), and neither is computed where nobody asks. That reaches into
+pgx, so only the tested versions are taken.
 """
 
 import importlib
 from contextlib import AbstractContextManager
-from functools import lru_cache
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 
 import jax
@@ -60,7 +60,7 @@ def _as_pgx_is_written() -> AbstractContextManager[None]:
     return jax.numpy_rank_promotion("allow")
 
 
-@lru_cache(maxsize=None)
+@cache
 def pgx_game(id: str) -> Game:
     """The game of a pgx id. Raises UserError where pgx is missing or of an untested version."""
     check_version()

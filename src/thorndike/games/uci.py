@@ -1,7 +1,7 @@
 """Engines that speak UCI, or USI, its twin for shogi: Stockfish, Fairy-Stockfish and others.
 
-python-chess speaks UCI too, but only of games that it knows the rules of, which Gardner's chess and animal shogi are not; here the rules are
-the game's own, and one client serves all.
+python-chess speaks UCI too, but only of games that it knows the rules of, which Gardner's chess and animal shogi are not; here the rules
+are the game's own, and one client serves all.
 """
 
 import math
@@ -22,7 +22,7 @@ _PAWNS_TO_ODDS = 400.0
 def uci_start(
     command: tuple[str, ...], options: Mapping[str, str], limit: Mapping[str, int], move_limit_s: float, protocol: str = "uci"
 ) -> Start:
-    """How to start an engine. ``limit`` is what ``go`` is told (``movetime``, ``depth``, ``nodes``); it is given up on after ``move_limit_s``."""
+    """How to start an engine. ``limit`` is what ``go`` is told (``movetime``, ...); it is given up on after ``move_limit_s`` seconds."""
     go = " ".join(["go", *(f"{name} {value}" for name, value in limit.items())])
 
     def start() -> Dialogue:
@@ -44,7 +44,7 @@ def uci_start(
             process.send(f"position startpos{' moves ' if played else ''}{played}")
             process.send(go)
             until, win_probability = time.monotonic() + move_limit_s, None
-            while not (words := process.line(until).split())[:1] == ["bestmove"]:
+            while (words := process.line(until).split())[:1] != ["bestmove"]:
                 win_probability = told_probability(words, win_probability)
             return Answered(words[1] if len(words) > 1 else "nothing", win_probability)
 
@@ -70,7 +70,7 @@ def told_probability(words: list[str], before: float | None) -> float | None:
     """The mover's probability of winning by a line of an engine's thoughts, or what was known before."""
     if words[:1] != ["info"] or "score" not in words:
         return before
-    kind, value = (words[words.index("score") + 1 :] + ["", ""])[:2]
+    kind, value = [*words[words.index("score") + 1 :], "", ""][:2]
     try:
         number = int(value)
     except ValueError:
