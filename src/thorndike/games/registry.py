@@ -23,7 +23,12 @@ OWN_GAMES: Mapping[str, str] = MappingProxyType(
     }
 )
 """Id -> ``module:attribute`` of the game."""
-ADAPTED_GAMES: Mapping[str, str] = MappingProxyType({})
+ADAPTED_GAMES: Mapping[str, str] = MappingProxyType(
+    dict.fromkeys(
+        ("othello", "hex", "go_9x9", "go_19x19", "chess", "gardner_chess", "shogi", "animal_shogi", "backgammon", "2048"),
+        "thorndike.games.pgx_games:pgx_game",
+    )
+)
 """Id -> ``module:function`` that makes the game of this id."""
 _FORMS = "path/to/file.py:NAME"
 

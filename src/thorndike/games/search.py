@@ -25,6 +25,9 @@ SEARCHES = ("gumbel", "puct")
 Evaluate: TypeAlias = Callable[[PyTree, Position, Key[Array, ""]], tuple[Float[Array, "B actions"], Float[Array, " B"]]]
 """parameters, positions ``[B]``, key -> logits of the moves, value in [-1, 1] for the player to move."""
 
+LONGEST_LINE = 8
+"""Moves of a principal variation."""
+
 
 class SearchSettings(NamedTuple):
     """How to search."""
@@ -55,6 +58,8 @@ class Found(NamedTuple):
     value: Float[Array, " B"]
     """Of the position, for the player to move, by all simulations."""
     visits: Int[Array, "B actions"]
+    line: Int[Array, "B length"]
+    """The moves tried most often one after another, ``action`` first; -1 beyond its end."""
 
 
 def search(
@@ -96,7 +101,22 @@ def search(
         )
         action = output.action
     summary = output.search_tree.summary()
-    return Found(action.astype(jnp.int32), output.action_weights, summary.value, summary.visit_counts.astype(jnp.int32))
+    action = action.astype(jnp.int32)
+    line = jax.vmap(_line)(output.search_tree, action)
+    return Found(action, output.action_weights, summary.value, summary.visit_counts.astype(jnp.int32), line)
+
+
+def _line(tree: mctx.Tree, action: Int[Array, ""]) -> Int[Array, " length"]:
+    """From the root of one tree: a move, and the replies that were tried most often."""
+
+    def follow(carry: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], Array]:
+        node, move = carry
+        child = jnp.where(move >= 0, tree.children_index[node, move], -1)
+        visits = tree.children_visits[child]
+        reply = jnp.where((child >= 0) & jnp.any(visits > 0), jnp.argmax(visits), -1).astype(jnp.int32)
+        return (jnp.maximum(child, 0), reply), move
+
+    return jax.lax.scan(follow, (jnp.int32(tree.ROOT_INDEX), action), None, length=LONGEST_LINE)[1]
 
 
 def _recurrent(game: Game, evaluate: Evaluate) -> mctx.RecurrentFn:
