@@ -49,7 +49,7 @@ def main(protocol, fault, folder):
             continue
         asked += 1
         restarted = len((folder / "started").read_text().split()) > 1
-        if fault == "dies" and known > 1 or fault == "dies-once" and known > 1 and not restarted:
+        if (fault == "dies" and known > 1) or (fault == "dies-once" and known > 1 and not restarted):
             os._exit(3)
         if fault == "hangs" and known > 1:
             time.sleep(600)

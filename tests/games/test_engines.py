@@ -158,7 +158,7 @@ def test_who_will_not_leave_is_ended_with_its_children(folder):
 def test_only_one_move_is_not_asked_for(board, folder):
     player = player_of(folder, "dies")
     position = board.init(jax.random.key(0))
-    moves = [named_action(board.game, position, name) for name in "b2 a1 c1 a3 a2 c2 b3 b1".split()]
+    moves = [named_action(board.game, position, name) for name in ["b2", "a1", "c1", "a3", "a2", "c2", "b3", "b1"]]
     for move in moves:
         position = board.play(position, move)
     assert player.choose(Turn(board.game, position, tuple(moves))).action == named_action(board.game, position, "c3")
@@ -188,12 +188,12 @@ def test_short_names_are_checked_at_once(monkeypatch):
 
 
 def test_probabilities_of_winning_are_read_from_thoughts():
-    assert told_probability("info depth 3 score cp 0 nodes 5".split(), None) == 0.5
-    assert told_probability("info score mate -3".split(), 0.4) == 0.0
-    assert told_probability("info score mate 1".split(), 0.4) == 1.0
-    assert told_probability("info score cp x".split(), 0.4) == 0.4
-    assert told_probability("info string score".split(), 0.4) == 0.4
-    assert told_probability("info depth 3".split(), 0.4) == 0.4
+    assert told_probability(["info", "depth", "3", "score", "cp", "0", "nodes", "5"], None) == 0.5
+    assert told_probability(["info", "score", "mate", "-3"], 0.4) == 0.0
+    assert told_probability(["info", "score", "mate", "1"], 0.4) == 1.0
+    assert told_probability(["info", "score", "cp", "x"], 0.4) == 0.4
+    assert told_probability(["info", "string", "score"], 0.4) == 0.4
+    assert told_probability(["info", "depth", "3"], 0.4) == 0.4
 
 
 def installed(names):
