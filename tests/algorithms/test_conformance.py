@@ -40,12 +40,13 @@ from thorndike.environments import novelty, wrappers
 from thorndike.environments.native import factory
 from thorndike.environments.native.vectorize import vectorize
 from thorndike.networks.torso import example_observation
-from thorndike.training import runner as runner_module
+from thorndike.training import segment as segment_module
 from thorndike.training.checkpoints import Progressed, restore, save_checkpoint
 from thorndike.training.dataset_source import dataset_source, dataset_spec
 from thorndike.training.policy import Policy
 from thorndike.training.run_directory import checkpoints
-from thorndike.training.runner import Carry, Runner, runner
+from thorndike.training.runner import Runner, runner
+from thorndike.training.segment import Carry
 from thorndike.training.sources import compiled_source
 from thorndike.types import Algorithm, Source, Wrapper
 
@@ -263,7 +264,7 @@ def bound(request, quick_compile) -> Bound:
 
     with pytest.MonkeyPatch.context() as patch:
         # Random numbers of five iterations at once, so that segments end within and across them.
-        patch.setattr(runner_module, "_ROWS_OF_A_PAGE", 5 * algorithm.needs.rollout_length * NUM_ENVS)
+        patch.setattr(segment_module, "_ROWS_OF_A_PAGE", 5 * algorithm.needs.rollout_length * NUM_ENVS)
         many = runner(algorithm._replace(update=counted), source, 3, range(SEEDS))
         alone = runner(algorithm, source, 3, [1])
     return Bound(request.param, many, alone, source, traces)

@@ -34,17 +34,18 @@ def add_board(studio: Studio) -> None:
                 Tag("p", "lead", "The studio keeps games while it runs. Save those that you want to see again.")
                 link("Begin another", "/", "button primary")
             return
-        with frame(look_of(place.setup.game).title) as notice:
-            page = _BoardPage(studio, name, place, notice)
+        with frame(look_of(place.setup.game).title):
+            page = _BoardPage(studio, name, place)
         await page.refresh()
 
 
 class _BoardPage:
     """One page, in one tab, of a table that others may be looking at too."""
 
-    def __init__(self, studio: Studio, name: str, place: Place, notice: Notice) -> None:
-        self._studio, self._name, self._table, self._notice = studio, name, place.table, notice
+    def __init__(self, studio: Studio, name: str, place: Place) -> None:
+        self._studio, self._name, self._table = studio, name, place.table
         self._look = look_of(place.setup.game)
+        self._alone = True if self._table.game.num_players == 1 else None
         self._moves: list[tuple[Tag, Tag]] = []
         self._names: tuple[str, ...] = ()
         self._asked = False
@@ -59,6 +60,8 @@ class _BoardPage:
         Tag("h1", "visually-hidden", self._look.title)
         with Tag("div", "status", "", {"aria-live": "polite", "aria-atomic": "true"}):
             self._status = Tag("p", "status-line")
+            # In the hint's place while there is something to say: the board stays where it is.
+            self._notice = Notice()
             self._hint = Tag("p", "hint")
         self._board = BoardElement()
         self._board.props["name"] = f"{self._look.title}, board: arrow keys move, Enter plays"
@@ -69,14 +72,15 @@ class _BoardPage:
             self._stop = button("Stop thinking", self._doing(lambda: self._table.interrupt()), "primary")
             self._go_on = button("Let it play", self._doing(lambda: self._table.go_on()), "primary")
             self._take_back = button("Take back", self._doing(lambda: self._table.take_back()))
-            button("Swap sides", self._doing(lambda: self._studio.swap_sides(self._name)))
+            swap = button("Swap sides", self._doing(lambda: self._studio.swap_sides(self._name)))
+            swap.set_attribute("hidden", self._alone)
             self._restart = button("New game", self._doing(lambda: self._table.restart()), asks=True)
             button("Save", self._save)
 
     def _add_side(self, place: Place) -> None:
         with Tag("div", "players"):
             self._players = [Tag("p", "player") for _ in self._look.sides[: self._table.game.num_players]]
-        with Tag("section", "panel", "", {"aria-label": "Win probability"}):
+        with Tag("section", "panel", "", {"aria-label": "Win probability"}) as chances:
             with Tag("div", "heading"):
                 Tag("h2", "", "Win probability")
                 self._chance = Tag("span", "chance")
@@ -102,10 +106,12 @@ class _BoardPage:
                     {"aria-label": "One move on"},
                 )
                 button("»", self._step(lambda view: len(view.moves)), "icon", {"aria-label": "To the last move"})
-        with Tag("details", "panel"):
+        with Tag("details", "panel") as others:
             Tag("summary", "", "Change the opponent")
             self._form = SetupForm(self._studio, place.setup)
             button("Change, and play on", self._change)
+        for needs_two in (chances, others, *self._players):
+            needs_two.set_attribute("hidden", self._alone)
 
     def _follow(self) -> None:
         """Draw again whenever something changes, in whichever thread or tab; until this page is gone for good."""

@@ -42,12 +42,14 @@ def link(text: str, address: str, classes: str = "") -> Tag:
 
 def select(label: str, options: Mapping[str, str], chosen: str, handler: TextHandler) -> Tag:
     """A labelled choice among options, by their values."""
-    with Tag("label", "field"):
-        Tag("span", "label", label)
+    with Tag("div", "field"):
+        words = Tag("label", "label", label)
         element = Tag("select", "select", "", {"value": chosen})
         with element:
             for value, text in options.items():
                 Tag("option", "", text, {"value": value})
+    # Beside it, not around it: the label around a list would be read out with all that is in the list.
+    words.set_attribute("for", f"c{element.id}")
     _on_value(element, "change", "event.target.value", handler)
     return element
 

@@ -5,7 +5,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
 
-from nicegui import app, run, ui
+from nicegui import app, context, run, ui
 
 from thorndike.errors import UserError
 from thorndike.web.controls import Tag, link
@@ -21,20 +21,24 @@ def serve_static_files() -> None:
 
 
 @contextmanager
-def frame(title: str) -> Iterator["Notice"]:
-    """A page with the heading of the studio; what is made inside is its content. Gives the line where mistakes are told."""
+def frame(title: str) -> Iterator[None]:
+    """A page with the heading of the studio; what is made inside is its content."""
     ui.page_title(f"{title} · Thorndike")
     ui.add_head_html(f'<link rel="stylesheet" href="{_AT}/studio.css"><meta name="color-scheme" content="light dark">')
+    # Quasar makes all of the page the main part, its heading too.
+    around = context.client.content.parent_slot
+    assert around is not None
+    around.parent.props["role"] = "none"
     with Tag("header", "top"):
         link("Thorndike", "/", "brand").props('aria-label="Thorndike, the studio: home"')
         with Tag("nav", "", "", {"aria-label": "Pages"}):
             link("Games", "/")
     with Tag("main", "page"):
-        yield Notice()
+        yield
 
 
 class Notice:
-    """One line that says what went wrong, and is spoken at once."""
+    """One line, where it is made, that says what went wrong and is spoken at once."""
 
     def __init__(self) -> None:
         self._line = Tag("p", "notice", "", {"role": "alert"})

@@ -4,7 +4,7 @@ from nicegui import run, ui
 
 from thorndike.games.saved_game import LARGEST
 from thorndike.web.controls import Tag, button, link, open_file
-from thorndike.web.frame import frame
+from thorndike.web.frame import Notice, frame
 from thorndike.web.icons import game_icon
 from thorndike.web.looks import look_of
 from thorndike.web.setup_form import SetupForm
@@ -17,7 +17,8 @@ def add_home(studio: Studio) -> None:
     @ui.page("/")
     async def home() -> None:
         being_played = await run.io_bound(lambda: _being_played(studio)) or {}
-        with frame("Games") as notice:
+        with frame("Games"):
+            notice = Notice()
 
             async def opened(text: str) -> None:
                 if not text:
@@ -53,7 +54,8 @@ def add_home(studio: Studio) -> None:
                 link("Choose another", "/", "button primary")
             return
         look = look_of(game_id)
-        with frame(look.title) as notice:
+        with frame(look.title):
+            notice = Notice()
             Tag("h1", "", look.title)
             Tag("p", "lead", look.rule)
             with Tag("section", "panel narrow", "", {"aria-label": "Who plays"}):

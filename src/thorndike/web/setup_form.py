@@ -2,7 +2,7 @@
 
 from thorndike.web.controls import Tag, select
 from thorndike.web.looks import look_of
-from thorndike.web.opponents import STRENGTHS
+from thorndike.web.opponents import ONE_PLAYER, STRENGTHS
 from thorndike.web.studio import Setup, Studio
 
 
@@ -13,7 +13,8 @@ class SetupForm:
         self.setup = setup
         self._offered = {opponent.id: opponent for opponent in studio.opponents(setup.game)}
         sides = look_of(setup.game).sides
-        with Tag("div", "fields"):
+        with Tag("div", "fields") as fields:
+            fields.set_attribute("hidden", True if setup.game in ONE_PLAYER else None)
             select("Opponent", {each.id: each.name for each in self._offered.values()}, setup.opponent, self._choose_opponent)
             strengths = {str(number): f"{number:,} simulations a move" for number in STRENGTHS}
             self._strength = select("Strength", strengths, str(setup.simulations), self._choose_strength)

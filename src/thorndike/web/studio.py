@@ -7,11 +7,12 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from thorndike.errors import UserError
+from thorndike.games.plies import next_ply
 from thorndike.games.registry import game as find_game
 from thorndike.games.saved_game import read_saved_game, saved_actions
 from thorndike.games.seats import Seat, computer, person
 from thorndike.games.table import Table
-from thorndike.web.opponents import ANOTHER_PERSON, PERSON, STRENGTH, Opponent, Opponents
+from thorndike.web.opponents import ALONE, ANOTHER_PERSON, ONE_PLAYER, PERSON, STRENGTH, Opponent, Opponents
 
 MOST_TABLES = 100
 """The one that was not looked at for the longest time makes room."""
@@ -47,11 +48,14 @@ class Studio:
 
     def opponents(self, game_id: str) -> tuple[Opponent, ...]:
         """Who plays a game, the likeliest choice first."""
-        return (*self._opponents(game_id), ANOTHER_PERSON)
+        return (*self._opponents(game_id), ALONE if game_id in ONE_PLAYER else ANOTHER_PERSON)
 
     def open(self, setup: Setup) -> str:
         """A new table; its name."""
         table = Table(find_game(setup.game), *self._seats(setup), seed=secrets.randbits(32))
+        first = table.view().ply
+        # Compiled now, not under somebody's first click.
+        next_ply(table.game, first, first.legal[0], table.seed)
         table.begin()
         return self._keep(Place(table, setup))
 
