@@ -12,6 +12,8 @@ from thorndike.cli.parser import Parser
 from thorndike.errors import UserError
 
 PORT = 8420
+_OPEN_TO_OTHERS = """\
+Other machines reach it by this machine's address, with the same token. Nothing is encrypted: use it in networks that you trust."""
 EXAMPLES = """\
   thorndike studio                   print an address to open in a browser; Ctrl-C ends the studio
   thorndike studio --open            open it, too
@@ -36,8 +38,8 @@ def run(words: Sequence[str]) -> Answer:
 
     def told(address: str) -> None:
         print(f"The studio is at {address}", flush=True)
-        if options.host != "127.0.0.1":
-            print("Whoever has this address can play here: it is not encrypted, so use it in networks that you trust.", file=sys.stderr)
+        if options.host not in ("127.0.0.1", "::1", "localhost"):
+            print(_OPEN_TO_OTHERS, file=sys.stderr)
         print("Ctrl-C ends it.", file=sys.stderr, flush=True)
         if options.open:
             webbrowser.open(address)

@@ -49,25 +49,27 @@ def opponents_in(output: Path) -> Opponents:
             return ()
         searched = game_id not in _WITHOUT_SEARCH
         found = [
-            _named(str(run), f"{run.parent.name}, {run.name}", searched, "Trained: ")
+            _named(str(run), f"{run.parent.name}, {run.name}", searched, before="Trained: ")
             for run in reversed(all_runs(output))
             if _trained_on(run, game_id)
         ]
         if searched and game_id not in _LONG:
-            found.append(_named("mcts", "Tree search, without a network", searches=True))
+            found.append(_named("mcts", "Tree search", searches=True, after=", without a network"))
         found += [_named(name, _ENGINE_NAMES.get(name, name)) for name in ENGINES if _plays(name, game_id)]
         return [*found, _named("random", "Random moves")]
 
     return opponents
 
 
-def _named(who: str, name: str, searches: bool = False, kind: str = "") -> Opponent:
+def _named(who: str, name: str, searches: bool = False, before: str = "", after: str = "") -> Opponent:
+    """``name`` is what it is called at the table; ``before`` and ``after`` are added where one chooses."""
+
     def make(game: Game, simulations: int) -> Player:
         from thorndike.api.playing import player
 
         return player(who, game, simulations=simulations)._replace(name=name)
 
-    return Opponent(who, kind + name, make, searches)
+    return Opponent(who, before + name + after, make, searches)
 
 
 def _trained_on(run: Path, game_id: str) -> bool:
