@@ -54,7 +54,7 @@ def test_points_of_go_and_othello_are_those_of_the_format():
 
 
 def test_the_main_line_of_a_tree_is_read():
-    text = "junk (;GM[1]SZ[9]PB[x\\]y]C[a (comment; with\n[marks\\]](1)];B[ee](;W[cc];B[tt])(;W[dd]))"
+    text = "junk (;GM[1]SZ[9]PB[x\\]y]C[a (comment; with\n[marks\\] (1)];B[ee](;W[cc];B[tt])(;W[dd]))"
     record = read_sgf(text, "x.sgf")
     assert record.players == ("x]y", "white")
     assert record.moves == ((0, "E5"), (1, "C7"), (0, "pass"))
@@ -143,23 +143,34 @@ def gnugo():
         return []
 
 
-@pytest.mark.parametrize("program", gnugo())
-def test_a_game_that_gnu_go_saved_replays_with_its_score(program, tmp_path, quick_compile):
-    command = (program, "--mode", "gtp", "--level", "1", "--chinese-rules", "--positional-superko", "--seed", "5", "--boardsize", "9")
-    process = EngineProcess(command)
+RULES = ("--boardsize", "9", "--chinese-rules", "--positional-superko")
+
+
+def self_play(program, seed):
+    """GNU Go against itself until nothing dead is left: the moves, and the score by its count."""
+    process = EngineProcess((program, "--mode", "gtp", "--level", "1", "--seed", str(seed), *RULES))
     told(process, "komi 7.5")
     moves = []
-    while [move.lower() for move in moves[-2:]] != ["pass", "pass"]:
+    while moves[-2:] != ["PASS", "PASS"]:
         moves.append(told(process, f"kgs-genmove_cleanup {('black', 'white')[len(moves) % 2]}", 60))
     score = told(process, "final_score", 60)
     process.close()
-    # It saves games in its own dialogue only, and only before they end: all moves but the last pass are repeated there.
-    orders = ["komi 7.5", *(f"force {move}" for move in moves[:-1]), "save game.sgf", "quit"]
-    words = [program, "--mode", "ascii", "--boardsize", "9", "--chinese-rules", "--positional-superko"]
+    return moves, score
+
+
+@pytest.mark.parametrize("program", gnugo())
+def test_a_game_that_gnu_go_saved_replays_with_its_score(program, tmp_path, quick_compile):
+    for seed in range(20):
+        moves, score = self_play(program, seed)
+        if "PASS" not in moves[:-2]:
+            break
+    # It saves games in its own dialogue only, and only before they end: all moves but the passes are repeated there.
+    orders = ["komi 7.5", *(f"force {move}" for move in moves[:-2]), "save game.sgf", "quit"]
+    words = [program, "--mode", "ascii", *RULES]
     subprocess.run(words, input="\n".join(orders) + "\n", cwd=tmp_path, text=True, capture_output=True, check=True, timeout=60)
     record = read_sgf((tmp_path / "game.sgf").read_text(), "game.sgf")
-    assert [name for _, name in record.moves] == [move if move != "PASS" else "pass" for move in moves[:-1]]
-    record = record._replace(moves=(*record.moves, ((len(moves) - 1) % 2, "pass")))
+    assert [name for _, name in record.moves] == moves[:-2]
+    record = record._replace(moves=(*record.moves, *((i % 2, "pass") for i in (len(moves), len(moves) + 1))))
     made = game("go_9x9")
     assert result_of(made, record_actions(made, record)) == ((1.0, -1.0) if score.startswith("B") else (-1.0, 1.0))
     slow = SlowGo(9)
