@@ -29,7 +29,8 @@ from thorndike.training.host_source import HostEngine, HostSource, host_source
 from thorndike.training.json_files import TEXT, Kind, check_fields, whole
 from thorndike.training.memory import check_memory
 from thorndike.training.presets import Preset, find_preset
-from thorndike.training.runner import Runner, page_length, runner
+from thorndike.training.runner import Runner, runner
+from thorndike.training.segment import page_length
 from thorndike.training.session import Plan
 from thorndike.training.sources import compiled_source
 from thorndike.types import Algorithm, Environment, EnvSpec, Source, Wrapper

@@ -109,6 +109,9 @@ def name_of(origin: object) -> str:
     """What a run is called by: the id where there is one, else the class."""
     if isinstance(origin, str):
         return origin
+    if isinstance(origin, type):
+        # Of a class, ``spec`` may be the property that its instances have.
+        return origin.__name__
     spec = getattr(origin, "spec", None)
     if spec is not None:
         return spec.id

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 _GRACE_S = 1.0
 """Between asking a program to leave and ending it."""
 _LONGEST_LINE = 100_000
+_WAITING_LINES = 1000
 
 
 class EngineFailure(Exception):
@@ -29,12 +30,14 @@ class EngineProcess:
             )
         except OSError as error:
             raise EngineFailure(f"cannot be started: {error.strerror}") from error
-        self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
-        threading.Thread(target=self._read, daemon=True).start()
+        self._lines: queue.Queue[str | None] = queue.Queue(_WAITING_LINES)
+        self._ended = False
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
 
     def _read(self) -> None:
         assert self._process.stdout is not None
-        # A line that never ends would fill the memory.
+        # Neither a line that never ends nor lines without end fill the memory: the program waits until they are read.
         with contextlib.suppress(ValueError):
             while line := self._process.stdout.readline(_LONGEST_LINE):
                 self._lines.put(line.decode(errors="replace").rstrip("\r\n"))
@@ -51,12 +54,14 @@ class EngineProcess:
 
     def line(self, until: float) -> str:
         """The next line, by ``time.monotonic()`` ``until``. Raises ``EngineFailure`` if there is none."""
+        if self._ended:
+            raise EngineFailure("ended unexpectedly")
         try:
             found = self._lines.get(timeout=max(until - time.monotonic(), 0))
         except queue.Empty:
             raise EngineFailure("did not answer in time") from None
         if found is None:
-            self._lines.put(None)
+            self._ended = True
             raise EngineFailure("ended unexpectedly")
         return found
 
@@ -70,6 +75,10 @@ class EngineProcess:
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
+        # The reader may be waiting for room.
+        while self._reader.is_alive():
+            with contextlib.suppress(queue.Empty):
+                self._lines.get(timeout=0.01)
         for pipe in (self._process.stdin, self._process.stdout):
             with contextlib.suppress(OSError):
                 if pipe is not None:
