@@ -48,6 +48,7 @@ BARS = (
     Bar("dqn", "LunarLander-v3", "mean", 200),
     Bar("sac", "Pendulum-v1", "mean", -165),
     Bar("sac", "MountainCarContinuous-v0", "mean", 93),
+    Bar("sac", "InvertedPendulum-v5", "mean", 1000),
     Bar("td3", "Pendulum-v1", "mean", -165),
     Bar("ddpg", "Pendulum-v1", "mean", -165),
     Bar("tqc", "Pendulum-v1", "mean", -165),

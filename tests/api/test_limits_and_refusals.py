@@ -3,6 +3,7 @@
 import subprocess
 import sys
 
+import gymnasium
 import jax
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from thorndike.api.loading import bounded
 from thorndike.environments import registry, wrappers
 from thorndike.environments.native import factory
 from thorndike.environments.native.vectorize import vectorize
-from thorndike.environments.origins import limit_of
+from thorndike.environments.origins import limit_of, name_of
 from thorndike.errors import UserError
 from thorndike.training.evaluation import Evaluation
 from thorndike.training.policy import Policy
@@ -73,3 +74,20 @@ def test_a_device_that_is_not_there_is_one_line(tmp_path):
     if found.returncode != 0:
         assert (found.returncode, found.stderr.count("\n")) == (2, 1), found.stderr
         assert "--device gpu: JAX has no such device here" in found.stderr
+
+
+def test_an_environment_wrapped_by_a_class_is_called_by_the_class():
+    class Doubled(gymnasium.RewardWrapper):
+        def __init__(self):
+            super().__init__(gymnasium.make("CartPole-v1"))
+
+        def reward(self, reward):
+            return 2 * reward
+
+    assert name_of(Doubled) == "Doubled"
+
+
+def test_a_learner_as_an_object_takes_what_train_takes(tmp_path):
+    learner = td.QLearning("FrozenLake-v1", output=tmp_path, name="lake", max_episode_steps=7, checkpoint_every=500)
+    assert learner.learn(1000).result.run.name.endswith("lake")
+    assert max(row.length for row in learner.evaluate(5).rows) <= 7

@@ -34,6 +34,10 @@ def test_settings_stand_as_flags_too():
     assert train.given_settings(options, "ppo") == {"gamma": 0.9, "learning_rate": 1e-3, "n_steps": 64}
 
 
+def test_a_run_may_be_named_like_an_algorithm():
+    assert train.named_algorithm(["--name", "ppo", "dqn", "CartPole-v1"]) == "dqn"
+
+
 def test_settings_of_another_algorithm_are_no_flags():
     with pytest.raises(UserError, match="unknown flag --buffer-size"):
         train._parse(["ppo", "CartPole-v1", "--buffer-size", "10"])

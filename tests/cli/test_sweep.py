@@ -63,7 +63,8 @@ MISTAKES = [
     (["sweep", "ppo", "CartPol-v1", "--over", "gamma=0.9,0.99"], "did you mean 'CartPole-v1'"),
     (["sweep", "planning", "FrozenLake-v1", "--over", "gamma=0.9,0.99"], "nothing to sweep"),
     (["sweep", "--resume", "nothing"], "there is no sweep"),
-    (["sweep", "ppo", "CartPole-v1", "--resume", "latest"], "leave the algorithm"),
+    (["sweep", "ppo", "CartPole-v1", "--resume", "latest"], "leave algorithm out"),
+    (["sweep", "--resume", "latest", "--fresh-seeds", "3"], "leave --fresh-seeds out"),
 ]
 
 

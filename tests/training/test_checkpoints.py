@@ -18,8 +18,9 @@ from thorndike.training import tree_files
 from thorndike.training.checkpoints import Progressed, restore, save_checkpoint
 from thorndike.training.json_files import as_bytes
 from thorndike.training.run_directory import checkpoints
-from thorndike.training.runner import Carry, Runner
+from thorndike.training.runner import Runner
 from thorndike.training.sealed_folders import NewFolder, SealedFolder, intact
+from thorndike.training.segment import Carry
 from training.damage import DAMAGES, HOSTILE, seal_again
 from training.faulty_disk import Dead, disk, dying_at, failing_at
 

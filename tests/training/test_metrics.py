@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import pytest
 
 from thorndike.training.metrics import MetricsLog
-from thorndike.training.runner import Report
+from thorndike.training.segment import Report
 from thorndike.types import EpisodeStats
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from thorndike.training import runner as runner_module
+from thorndike.training import segment
 from thorndike.training.runner import run_keys, runner
 from thorndike.types import Algorithm, EnvSpec, EpisodeStats, Needs, Source
 
@@ -47,7 +47,7 @@ def noting_source(compiled: bool) -> Source:
 def noted(compiled: bool, indices: range, segments: list[int], seed: int = 0) -> dict[str, np.ndarray]:
     """Means of each segment ``[segments, S]``."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(runner_module, "_ROWS_OF_A_PAGE", PAGE)
+        patch.setattr(segment, "_ROWS_OF_A_PAGE", PAGE)
         bound = runner(noting_algorithm(), noting_source(compiled), seed, indices)
     carry, first, reports = bound.init(), 0, []
     for count in segments:
@@ -81,8 +81,8 @@ def test_segments_may_be_cut_anywhere_and_report_the_mean_of_their_iterations(co
     """Across the end of the warm-up (whose metrics are its own) and of pages of random numbers."""
     single, cut = noted(compiled, range(2), [1] * 13), noted(compiled, range(2), [3, 1, 6, 3])
     for name in single:
-        for segment, (start, end) in enumerate([(0, 3), (3, 4), (4, 10), (10, 13)]):
-            np.testing.assert_allclose(cut[name][segment], single[name][start:end].mean(axis=0), rtol=1e-6)
+        for part, (start, end) in enumerate([(0, 3), (3, 4), (4, 10), (10, 13)]):
+            np.testing.assert_allclose(cut[name][part], single[name][start:end].mean(axis=0), rtol=1e-6)
 
 
 def test_a_segment_over_the_end_of_the_warm_up_reports_what_was_learnt():

@@ -14,7 +14,8 @@ from thorndike.training.checkpoints import Progressed
 from thorndike.training.host_source import HostSource
 from thorndike.training.metrics import last_points
 from thorndike.training.progress import Progress
-from thorndike.training.runner import Report, Runner
+from thorndike.training.runner import Runner
+from thorndike.training.segment import Report
 from thorndike.training.session import Keeping, Outcome, Plan, Start, run_session
 from thorndike.types import EpisodeStats
 

@@ -11,7 +11,8 @@ import pytest
 from thorndike.environments import registry
 from thorndike.environments.wrappers import chain
 from thorndike.errors import UserError
-from thorndike.training.runner import RUN_ONCE, agent_keys, runner
+from thorndike.training.runner import agent_keys, runner
+from thorndike.training.segment import RUN_ONCE
 from thorndike.training.sources import compiled_source
 from thorndike.training.varied import NotTraceable, find_traced, form_of, numbers_of, outcome_shapes, settle, varied
 from thorndike.types import Needs

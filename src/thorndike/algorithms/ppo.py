@@ -41,7 +41,7 @@ from thorndike.functional.shuffling import minibatch_size, minibatches
 from thorndike.networks.cnn import CNNS
 from thorndike.networks.heads import Shape, softmax_probabilities, stochastic_policy
 from thorndike.networks.hidden_layers import look_into_rollout
-from thorndike.networks.network import Network, NetworkBuilder, apply_rollout, apply_step, as_rows, begins_episode, fresh_memory
+from thorndike.networks.network import Network, NetworkBuilder, apply_step, as_rows, begins_episode, fresh_memory, rollout_values
 from thorndike.networks.recurrent import MEMORIES
 from thorndike.networks.torso import ACTIVATIONS, example_observation
 from thorndike.settings import AtLeast, Between, MoreThan, OneOf, check
@@ -137,7 +137,7 @@ def ppo_loss(
 def prepare(rollout: Rollout, params: PyTree, network: Network, config: Config) -> Minibatch:
     """Values, advantages and value targets of a whole rollout: as rows ``[T * B, ...]``, or with memory as it is, ``[T, B, ...]``."""
     step = rollout.step
-    (_, value), (_, next_value) = apply_rollout(network, params, rollout)
+    value, next_value = rollout_values(network, params, rollout)
     advantage = generalized_advantage(
         step.reward, value, next_value, step.terminated, step.done | ~step.valid, config.gamma, config.gae_lambda
     )

@@ -12,8 +12,8 @@ from thorndike.records import POLICY_FORMAT
 from thorndike.training.host_source import HostSource
 from thorndike.training.json_files import as_bytes
 from thorndike.training.metrics import LogPoint
-from thorndike.training.runner import Carry
 from thorndike.training.sealed_folders import NewFolder
+from thorndike.training.segment import Carry
 from thorndike.training.space_files import space_to_json
 from thorndike.training.tree_files import write_tree
 

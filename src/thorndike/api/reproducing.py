@@ -22,8 +22,8 @@ from thorndike.training.metrics import LogPoint
 from thorndike.training.notices import notice
 from thorndike.training.progress import Progress
 from thorndike.training.run_directory import checkpoints, read_lines
-from thorndike.training.runner import Carry
 from thorndike.training.sealed_folders import Damaged, SealedFolder
+from thorndike.training.segment import Carry
 from thorndike.training.session import Keeping, Start, run_session
 from thorndike.training.tree_files import named_arrays, read_arrays
 from thorndike.types import Wrapper

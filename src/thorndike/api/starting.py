@@ -18,7 +18,7 @@ from thorndike.replay.off_policy import State
 from thorndike.replay.uniform import ReplayBuffer, add
 from thorndike.training.checkpoints import load_checkpoint
 from thorndike.training.dataset_source import whole_dataset
-from thorndike.training.runner import Carry
+from thorndike.training.segment import Carry
 
 
 def offline_request(run: Path, algorithm: str, environment: str) -> Request:

@@ -18,7 +18,8 @@ from thorndike.errors import UserError
 from thorndike.training.host_source import HostSource
 from thorndike.training.lanes import Trained, finite_actors, score_lanes, train_lanes
 from thorndike.training.policy import Policy
-from thorndike.training.runner import RUN_ONCE, agent_keys
+from thorndike.training.runner import agent_keys
+from thorndike.training.segment import RUN_ONCE
 from thorndike.training.sweep_directory import TrialRow
 from thorndike.training.sweep_ranges import Settings
 from thorndike.training.varied import Build, LaneSettings, find_traced, form_of, numbers_of, settle, varied

@@ -30,7 +30,7 @@ from thorndike.training.notices import notice
 from thorndike.training.progress import Progress
 from thorndike.training.run_directory import facts, read_run, write_json
 from thorndike.training.run_lock import run_lock
-from thorndike.training.runner import Stopwatch
+from thorndike.training.segment import Stopwatch
 from thorndike.training.stopping import Terminated
 from thorndike.training.sweep_directory import (
     FACTS,

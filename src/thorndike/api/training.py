@@ -37,7 +37,7 @@ from thorndike.training.notices import notice
 from thorndike.training.progress import Progress
 from thorndike.training.run_directory import checkpoints, facts, new_run_directory, truncate_lines, write_json
 from thorndike.training.run_lock import run_lock
-from thorndike.training.runner import Stopwatch
+from thorndike.training.segment import Stopwatch
 from thorndike.training.session import RECENT, Keeping, NotFinite, Outcome, Start, run_session
 from thorndike.types import Wrapper
 

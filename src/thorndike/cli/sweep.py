@@ -39,16 +39,17 @@ SHOWN = 10
 
 def run(words: Sequence[str]) -> Answer:
     """Sweep, and say which settings won, what they are worth, and which mattered."""
-    options = _parse(words)
+    options, given = _parse(words)
     if options.plot is not None:
         check_plot_file(options.plot)
-    found = _resumed(options) if options.resume is not None else _swept(options, words)
+    found = _resumed(options, given) if options.resume is not None else _swept(options, words)
     if options.plot is not None:
         found.plot(options.plot)
     return Answer(_data(found), _drawn(found, options.plot))
 
 
-def _parse(words: Sequence[str]) -> Namespace:
+def _parse(words: Sequence[str]) -> tuple[Namespace, list[str]]:
+    """The options, and the names of those that were given."""
     parser = Parser("sweep", "Search settings: a grid, random trials or Optuna, all seeds in few compiled programs.", EXAMPLES)
     algorithm = named_algorithm(words)
     add_training_arguments(parser, read_config_fields(algorithm) if algorithm in ALGORITHMS else {})
@@ -69,7 +70,8 @@ def _parse(words: Sequence[str]) -> Namespace:
     parser.add_argument("--resume", metavar="SWEEP", help="go on with an interrupted sweep: its directory, a part of its name, or latest")
     parser.add_argument("--name", help="the last part of the sweep's directory's name")
     add_output_argument(parser)
-    return parser.parse(words)
+    options = parser.parse(words)
+    return options, [name for name, value in vars(options).items() if value != parser.get_default(name)]
 
 
 def _swept(options: Namespace, words: Sequence[str]) -> "Sweep":
@@ -117,10 +119,13 @@ def _swept(options: Namespace, words: Sequence[str]) -> "Sweep":
     )
 
 
-def _resumed(options: Namespace) -> "Sweep":
+def _resumed(options: Namespace, given: Sequence[str]) -> "Sweep":
     """Everything is read from ``sweep.json``, so nothing else may be given."""
-    if options.over or options.algorithm is not None or options.trials is not None:
-        raise UserError("--resume goes on with what a sweep was asked for: leave the algorithm, the environment and --over out")
+    others = [name for name in given if name not in ("resume", "output", "plot", "json")]
+    if others:
+        flag = others[0].removeprefix("setting ").replace("_", "-")
+        shown = flag if flag in ("algorithm", "environment") else f"--{flag}"
+        raise UserError(f"--resume goes on with what the sweep was asked for, which cannot be changed: leave {shown} out")
     path = find_sweep(options.resume, options.output)
     read_sweep(path)
     from thorndike.api import resume_sweep

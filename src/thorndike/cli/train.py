@@ -147,7 +147,12 @@ def named_algorithm(words: Sequence[str]) -> str | None:
             return value
         if flag.startswith("--algo="):
             return flag.partition("=")[2]
-    return next((word for word in words if word in ALGORITHMS), None)
+    places = (word for before, word in zip(["", *words], words, strict=False) if before not in _FREE_TEXT)
+    return next((word for word in places if word in ALGORITHMS), None)
+
+
+_FREE_TEXT = ("--name", "--output", "--env")
+"""Flags whose value may be an algorithm's name without meaning it."""
 
 
 def names(options: Namespace) -> tuple[str, str]:

@@ -8,6 +8,9 @@ from jaxtyping import Array, Float
 _NARROW = 128
 """Widths up to which the gradient's own form wins; where both are above, the copies cost what they save (measured with 256 x 256)."""
 
+_FEW = 32
+"""Widths up to which columns are the cheaper ones to copy."""
+
 
 @jax.custom_vjp
 def product(x: Float[Array, "*B I"], kernel: Float[Array, "I O"]) -> Float[Array, "*B O"]:
@@ -32,11 +35,15 @@ def _backward(held: tuple[Array, Array], gradient: Float[Array, "*B O"]) -> tupl
 
 
 def _kernel_gradient(rows: Float[Array, "N I"], columns: Float[Array, "N O"]) -> Float[Array, "I O"]:
-    """The sum of outer products; the narrower of the two matrices is the one that is copied to its transpose."""
+    """The sum of outer products. One of the two matrices is copied to its transpose: the columns if they are few, else the rows.
+
+    Measured for 400 x 64 (120 x 84, 256 x 12) and 128 to 2048 rows: 190 (140, 200) Gflop/s with the columns copied, 245 (190, 130) with
+    the rows.
+    """
     inputs, outputs = rows.shape[1], columns.shape[1]
     if outputs == 1:
         return (columns.T @ rows).T
-    if outputs < inputs:
+    if outputs < inputs and outputs <= _FEW:
         return optimization_barrier(optimization_barrier(columns.T) @ rows).T
     return optimization_barrier(rows.T) @ columns
 

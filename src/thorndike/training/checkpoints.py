@@ -17,8 +17,9 @@ from thorndike.training.host_source import HostSource
 from thorndike.training.json_files import OBJECT, SECONDS, Json, as_bytes, check_fields, parse_object, whole
 from thorndike.training.notices import notice
 from thorndike.training.run_directory import checkpoints, truncate_lines
-from thorndike.training.runner import Carry, Runner
+from thorndike.training.runner import Runner
 from thorndike.training.sealed_folders import Damaged, NewFolder, SealedFolder, discard
+from thorndike.training.segment import Carry
 from thorndike.training.tree_files import read_tree, write_tree
 
 STATE = "state"

@@ -13,7 +13,8 @@ import jax
 import numpy as np
 from safetensors.numpy import save_file
 
-from thorndike.training.runner import Carry, Runner
+from thorndike.training.runner import Runner
+from thorndike.training.segment import Carry
 from thorndike.training.tree_files import named_arrays
 from thorndike.types import Rollout
 

@@ -11,7 +11,8 @@ from jaxtyping import Array, PyTree
 from thorndike.training.evaluation import evaluate
 from thorndike.training.host_source import HostEngine, environment_seeds
 from thorndike.training.policy import Policy
-from thorndike.training.runner import Carry, Report, Runner
+from thorndike.training.runner import Runner
+from thorndike.training.segment import Carry, Report
 from thorndike.types import EnvSpec, Observation, Step
 
 _SCORING = 0x53434F52

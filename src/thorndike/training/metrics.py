@@ -11,8 +11,8 @@ import numpy as np
 from thorndike.training.json_files import Json
 from thorndike.training.notices import notice
 from thorndike.training.run_directory import append_lines, read_lines, refuse_if_gone
-from thorndike.training.runner import Report
 from thorndike.training.sealed_folders import flush
+from thorndike.training.segment import Report
 from thorndike.training.tensorboard import EventWriter
 
 

@@ -15,7 +15,8 @@ from thorndike.training.metrics import LogPoint, MetricsLog
 from thorndike.training.notices import notice
 from thorndike.training.progress import Progress
 from thorndike.training.run_directory import refuse_if_gone
-from thorndike.training.runner import Carry, Report, Runner
+from thorndike.training.runner import Runner
+from thorndike.training.segment import Carry, Report
 from thorndike.training.stopping import saving, stop_requests
 
 FIRST_LOOK, LOOK_EVERY = 10, 5

@@ -13,7 +13,7 @@ from jaxtyping import Array, Key, PyTree
 
 from thorndike.functional.schedules import Rate, parse_rate
 from thorndike.networks.torso import example_observation
-from thorndike.training.runner import over_seeds
+from thorndike.training.segment import over_seeds
 from thorndike.types import Algorithm, EnvSpec, Metrics, Observation, Rollout, Step
 
 Numbers: TypeAlias = tuple[Array, ...]
