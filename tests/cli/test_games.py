@@ -197,7 +197,7 @@ def test_the_public_api_plays(place):
 
 @pytest.mark.slow
 def test_a_trained_run_plays(place, capsys):
-    run = td.train("alphazero", "tic_tac_toe", total_steps=512, num_envs=8, learning_starts=64, batch_size=32).run
+    run = td.train("alphazero", "tic_tac_toe", steps=512, num_envs=8, settings={"learning_starts": 64, "batch_size": 32}).run
     assert main(["arena", "tic_tac_toe", "latest", "random", "--games", "4", "--simulations", "8", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["players"][0]["player"] == run.name
