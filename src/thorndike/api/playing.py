@@ -5,6 +5,8 @@ from itertools import combinations
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
+import jax
+
 from thorndike.api.loading import LoadedPolicy, load
 from thorndike.errors import UserError
 from thorndike.games.agent_player import SIMULATIONS, agent_player
@@ -51,7 +53,7 @@ def player(who: PlayerLike, game: Game | str, *, simulations: int = SIMULATIONS,
         if is_engine(who):
             return engine(who, rules.id)
     loaded = who if isinstance(who, LoadedPolicy) else load(who)
-    if loaded.facts["environment"] != rules.id:
+    if loaded.facts["environment"] not in (rules.id, game):
         raise UserError(f"{loaded.run} was trained on {loaded.facts['environment']}, not on {rules.id}")
     return _agent(loaded, rules, simulations)
 
@@ -75,7 +77,7 @@ def play_match(
     rules = find_game(game) if isinstance(game, str) else game
     if games < 1 or opening_plies < 0 or simulations < 0:
         raise UserError(f"a match needs games >= 1, opening_plies >= 0 and simulations >= 0; got {games}, {opening_plies}, {simulations}")
-    sides = player(first, rules, simulations=simulations, seed=seed), player(second, rules, simulations=simulations, seed=seed + 1)
+    sides = player(first, game, simulations=simulations, seed=seed), player(second, game, simulations=simulations, seed=seed + 1)
     try:
         return _played(rules, sides, games, seed, opening_plies, save, progress)
     finally:
@@ -100,7 +102,7 @@ def arena(
         raise UserError("an arena needs at least two players")
     if games < 1 or opening_plies < 0 or simulations < 0:
         raise UserError(f"an arena needs games >= 1, opening_plies >= 0 and simulations >= 0; got {games}, {opening_plies}, {simulations}")
-    sides = [player(who, rules, simulations=simulations, seed=seed + i) for i, who in enumerate(players)]
+    sides = [player(who, game, simulations=simulations, seed=seed + i) for i, who in enumerate(players)]
     try:
         names = _different([side.name for side in sides])
         sides = [side._replace(name=name) for side, name in zip(sides, names, strict=True)]
@@ -140,8 +142,6 @@ def _rows(pair: tuple[int, int], match: Match) -> list[Games]:
 
 
 def _agent(loaded: LoadedPolicy, rules: Game, simulations: int) -> Player:
-    import jax
-
     policy = loaded.policy
     actor, statistics = jax.tree.map(lambda leaf: leaf[policy.best], (policy.actors, policy.statistics))
     label = loaded.run.name if loaded.run is not None else "agent"
