@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from itertools import combinations
 from pathlib import Path
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias, cast
 
 import jax
 
@@ -16,10 +16,11 @@ from thorndike.games.match import Match, as_record
 from thorndike.games.match import play_match as play
 from thorndike.games.match_file import PlayedGame
 from thorndike.games.pgn import write_pgn
-from thorndike.games.player_names import MCTS, RANDOM, check_player, mcts_simulations
+from thorndike.games.player_names import MCTS, RANDOM, TRAINED, check_player, mcts_simulations
 from thorndike.games.players import mcts_player, random_player
 from thorndike.games.registry import game as find_game
 from thorndike.games.sgf import can_be_sgf, write_sgf
+from thorndike.games.trained import trained_run
 from thorndike.statistics.ratings import Games, Ratings, fit_ratings
 
 PlayerLike: TypeAlias = str | Path | Player | LoadedPolicy
@@ -52,6 +53,8 @@ def player(who: PlayerLike, game: Game | str, *, simulations: int = SIMULATIONS,
             return mcts_player(rules, mcts_simulations(who, simulations), seed)
         if is_engine(who):
             return engine(who, rules.id)
+    if who == TRAINED:
+        return _agent(load(cast(Path, trained_run(rules.id))), rules, simulations)._replace(name=TRAINED)
     loaded = who if isinstance(who, LoadedPolicy) else load(who)
     if loaded.facts["environment"] not in (rules.id, game):
         raise UserError(f"{loaded.run} was trained on {loaded.facts['environment']}, not on {rules.id}")

@@ -11,7 +11,7 @@ from thorndike.records import from_policy, read_policy_facts
 from thorndike.suggestions import did_you_mean
 
 GAME_HELP = "a game: connect_four, othello, go_9x9, chess, ...; or yours, path/to/file.py:NAME"
-PLAYER_HELP = "random, mcts, mcts:simulations=400, gnugo:level=3, rhino:level=3, stockfish:elo=1500, fairy:skill=-10, or a run"
+PLAYER_HELP = "random, mcts, mcts:simulations=400, trained, gnugo:level=3, rhino:level=3, stockfish:elo=1500, fairy:skill=-10, or a run"
 _ALONE = ("2048",)
 _WITH_DICE = ("backgammon",)
 
