@@ -23,8 +23,11 @@ _LINE = 5
 class TerminalGame:
     """One game, asked for line by line."""
 
-    def __init__(self, game: Game, opponent: Player | None, adviser: Player | None, person: int, seed: int) -> None:
+    def __init__(
+        self, game: Game, opponent: Player | None, adviser: Player | None, person: int, seed: int, opponent_compiles: bool = False
+    ) -> None:
         """``opponent`` None: the person plays alone; ``person``: 0 moves first, 1 second."""
+        self._opponent_compiles = opponent_compiles
         self._game, self._opponent, self._adviser, self._person, self._seed = game, opponent, adviser, person, seed
         self._plies = [first_ply(game, seed)]
         self._actions: list[int] = []
@@ -49,6 +52,8 @@ class TerminalGame:
                 self._ask(self._opponent)
             else:
                 self._listen()
+        # A program that leaves while it compiles may crash.
+        self._warming.join()
 
     def close(self) -> None:
         """End the opponent, and who advises."""
@@ -87,7 +92,7 @@ class TerminalGame:
     def _warm_up(self) -> None:
         """Compile while the person looks at the board, so that the first answer comes as fast as the others."""
         next_ply(self._game, self._plies[0], self._plies[0].legal[0], self._seed)
-        if self._opponent is not None and self._person == 0:
+        if self._opponent is not None and self._opponent_compiles and self._person == 0:
             self._opponent.choose(Turn(self._game, self._plies[0].position, ()))
 
     def _asked(self, player: Player) -> Choice:
