@@ -1,6 +1,7 @@
 """A person at the terminal against a player: the board as text, moves by name, advice, take back, save."""
 
 import threading
+import time
 from pathlib import Path
 
 from thorndike.cli.answer import printable
@@ -32,7 +33,7 @@ class TerminalGame:
         self._plies = [first_ply(game, seed)]
         self._actions: list[int] = []
         self._choices: dict[int, Choice] = {}
-        self._score = 0.0
+        self._score, self._slowest = 0.0, 0.0
         self._gave_up, self._left = False, False
         self._warming = threading.Thread(target=self._warm_up, daemon=True)
 
@@ -67,7 +68,8 @@ class TerminalGame:
         score = None if not over else self._score if self._opponent is None else self._outcome()
         against = None if self._opponent is None else self._opponent.name
         names = self._names()
-        return {"game": self._game.id, "against": against, "person": self._person, "over": over, "score": score, "moves": names}
+        told = {"game": self._game.id, "against": against, "person": self._person, "over": over, "score": score, "moves": names}
+        return {**told, "slowest_answer_s": self._slowest}
 
     def farewell(self) -> str:
         """The last line."""
@@ -98,7 +100,10 @@ class TerminalGame:
     def _asked(self, player: Player) -> Choice:
         if self._warming.is_alive():
             self._warming.join()
-        return player.choose(Turn(self._game, self._now.position, tuple(self._actions)))
+        began = time.monotonic()
+        choice = player.choose(Turn(self._game, self._now.position, tuple(self._actions)))
+        self._slowest = max(self._slowest, time.monotonic() - began)
+        return choice
 
     def _ask(self, player: Player) -> None:
         choice = self._asked(player)
