@@ -22,18 +22,18 @@ _RESAMPLES = 2_000
 class Share(NamedTuple):
     """Of how many something is true."""
 
-    count: int
+    hits: int
     of: int
 
     @property
     def value(self) -> float | None:
         """The share, None of nothing."""
-        return self.count / self.of if self.of else None
+        return self.hits / self.of if self.of else None
 
     @property
     def ci95(self) -> tuple[float, float] | None:
         """Wilson's interval."""
-        return wilson_interval(self.count, self.of) if self.of else None
+        return wilson_interval(self.hits, self.of) if self.of else None
 
 
 class RaterReport(NamedTuple):

@@ -93,6 +93,8 @@ def check_response(response: Response) -> None:
         raise UserError(f"the strength is {quoted(response.strength)}, but it must be 1 (slightly), 2 (clearly) or 3 (much)")
     if len(response.reason) > _LONGEST_REASON:
         raise UserError(f"the reason has {len(response.reason):,} characters, {_LONGEST_REASON:,} are allowed")
+    if "\0" in response.reason or any("\ud800" <= each <= "\udfff" for each in response.reason):
+        raise UserError("the reason holds what is no text")
     if response.milliseconds is not None and not 0 <= response.milliseconds <= _LONGEST_TIME_MS:
         raise UserError(f"the time is {quoted(response.milliseconds)} ms, but it must be from 0 to a week")
     if (response.ranks is not None) != (response.verdict == "ranking"):

@@ -3,7 +3,7 @@
 A tie counts as half a vote for either side, except in ``davidson``, which says how likely ties are.
 """
 
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
 
@@ -12,7 +12,8 @@ from thorndike.language.preferences.comparisons import Comparisons, Floats
 
 _ITERATIONS = 500
 _TOLERANCE = 1e-9
-METHODS = ("mean", "majority", "dawid_skene")
+Method: TypeAlias = Literal["mean", "majority", "dawid_skene"]
+METHODS = get_args(Method)
 
 
 class Belief(NamedTuple):
@@ -21,7 +22,7 @@ class Belief(NamedTuple):
     first_is_better: Floats
     """``[pairs]``, from 0 to 1: soft labels."""
     reliability: Floats
-    """``[raters]``: the chance that a rater says what is so. About 0.5 for one who guesses, below for one who has it the wrong way round."""
+    """``[raters]``: the chance that a rater says what is so: about 0.5 for who guesses, less for who has it the wrong way round."""
 
 
 class DawidSkene(NamedTuple):
@@ -30,19 +31,18 @@ class DawidSkene(NamedTuple):
     belief: Belief
     prior_first: float
     """The share of pairs whose first is better."""
-    iterations: int
 
 
 class Davidson(NamedTuple):
     """Strengths of candidates when ties are an answer of their own."""
 
     strengths: dict[int, float]
-    """Of each candidate, by number, a log-odds scale; the mean of those that are compared with each other is 0."""
+    """Of each candidate, by number, on a scale of log-odds; their mean is 0."""
     tie: float
     """nu: two equals tie with chance nu / (2 + nu)."""
 
 
-def believe(comparisons: Comparisons, method: Literal["mean", "majority", "dawid_skene"]) -> Belief:
+def believe(comparisons: Comparisons, method: Method) -> Belief:
     """By one of ``METHODS``. Raises ``UserError`` for another."""
     match method:
         case "mean":
@@ -76,15 +76,15 @@ def dawid_skene(comparisons: Comparisons, prior: tuple[float, float] = (4.0, 2.0
     form: Zhang et al. 2014, arXiv 1406.3824.
     """
     right, wrong = prior
-    if not (right >= 1 and wrong >= 1 and right > wrong):
+    if not (wrong >= 1 and right > wrong):
         raise UserError(f"the prior is {prior}, but it must be two numbers of at least 1, the first one greater")
     pair, rater, value = comparisons.pair, comparisons.rater, comparisons.value
     votes = np.bincount(rater, minlength=len(comparisons.raters))
-    first, share, iteration = mean_labels(comparisons).first_is_better, 0.5, 0
-    for iteration in range(1, _ITERATIONS + 1):
+    first, reliability, share = mean_labels(comparisons).first_is_better, np.full(len(votes), 0.5), 0.5
+    for _ in range(_ITERATIONS):
         agreed = np.bincount(rater, value * first[pair] + (1 - value) * (1 - first[pair]), len(comparisons.raters))
         # The mode of the posterior; it stays inside (0, 1), so that no rater is believed whatever others say.
-        reliability = (agreed + right - 1) / (votes + right + wrong - 2) if right + wrong > 2 else agreed / np.maximum(votes, 1)
+        reliability = (agreed + right - 1) / (votes + right + wrong - 2)
         reliability = np.clip(reliability, 1e-6, 1 - 1e-6)
         share = float(np.clip((first.sum() + 1) / (len(first) + 2), 1e-6, 1 - 1e-6))
         evidence = (2 * value - 1) * np.log(reliability / (1 - reliability))[rater]
@@ -94,7 +94,7 @@ def dawid_skene(comparisons: Comparisons, prior: tuple[float, float] = (4.0, 2.0
         first = renewed
         if change < _TOLERANCE:
             break
-    return DawidSkene(Belief(first, reliability if len(first) else np.zeros(0)), share, iteration)
+    return DawidSkene(Belief(first, reliability), share)
 
 
 def davidson(comparisons: Comparisons, prior: float = 0.1, iterations: int = 2_000) -> Davidson:
@@ -118,7 +118,7 @@ def davidson(comparisons: Comparisons, prior: float = 0.1, iterations: int = 2_0
         shares = np.bincount(first, (1 + nu * root / (2 * p[first])) / total, len(numbers))
         shares += np.bincount(second, (1 + nu * root / (2 * p[second])) / total, len(numbers))
         renewed = wins / (shares + prior / (p + 1))
-        nu_renewed = (ties + 0.5) / (float((root / total).sum()) + 0.5 / max(nu, 1e-9)) if len(comparisons.pair) else nu
+        nu_renewed = ties / float((root / total).sum()) if len(root) else 0.0
         moved = max(float(np.abs(np.log(renewed / p)).max(initial=0.0)), abs(nu_renewed - nu))
         p, nu = renewed, nu_renewed
         if moved < 1e-10:

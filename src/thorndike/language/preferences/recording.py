@@ -1,7 +1,7 @@
 """How judgements are written down: appended in one transaction each, and never twice."""
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 from sqlalchemy import ColumnElement, Connection, FromClause, and_, func, insert, or_, select, update
 from sqlalchemy.exc import IntegrityError
@@ -31,6 +31,22 @@ def undo(database: Database, rater: int, request: str) -> int | None:
     table = schema.judgement
     with database.reading() as connection:
         return int(connection.execute(select(table.c.assignment_id).where(table.c.id == number)).scalar_one())
+
+
+def add_judged(connection: Connection, item: int, rater: int, ranks: Sequence[int]) -> bool:
+    """A judgement that was made elsewhere, by position; whether it is new."""
+    asked = schema.assignment
+    if connection.execute(select(asked.c.id).where(asked.c.item_id == item, asked.c.rater_id == rater)).scalar() is not None:
+        return False
+    turn = connection.execute(select(func.count()).where(asked.c.rater_id == rater)).scalar_one()
+    shown = list(range(len(ranks)))
+    values = {"item_id": item, "rater_id": rater, "turn": turn, "repeated": 0, "shown": shown, "created": time.time()}
+    number = connection.execute(insert(asked).values(values).returning(asked.c.id)).scalar_one()
+    response = Response(number, "ranking", f"imported {item} {rater}", ranks, client="imported")
+    said = {"verdict": response.verdict, "ranks": ranks_by_position(response, shown), "reason": "", "client": response.client}
+    _add(connection, number, None, said | {"request": response.request})
+    _renew_state(connection, item)
+    return True
 
 
 def standing(table: FromClause) -> ColumnElement[bool]:

@@ -85,7 +85,17 @@ class Store:
     def add_items(self, project: int, items: Iterable[NewItem]) -> int:
         """Add questions, all or none of them; how many were new. One with the same prompt and candidates as another is not added again."""
         with self.database.writing() as connection:
-            return sum(_add_item(connection, project, item) for item in items)
+            return sum(_add_item(connection, project, item)[1] for item in items)
+
+    def add_judged(self, project: int, rater: int, items: Iterable[tuple[NewItem, Sequence[int]]]) -> tuple[int, int]:
+        """Add questions with a rater's ranks, by position, all or none of them; how many questions and how many judgements were new."""
+        with self.database.writing() as connection:
+            questions = judgements = 0
+            for item, ranks in items:
+                number, is_new = _add_item(connection, project, item)
+                questions += is_new
+                judgements += recording.add_judged(connection, number, rater, ranks)
+            return questions, judgements
 
     def set_priorities(self, priorities: Mapping[int, float]) -> None:
         """Which items to ask first: the highest, such as where an ensemble of reward models disagrees most."""
@@ -190,7 +200,7 @@ class Store:
         return int(found)
 
 
-def _add_item(connection: Connection, project: int, new: NewItem) -> bool:
+def _add_item(connection: Connection, project: int, new: NewItem) -> tuple[int, bool]:
     if len(new.candidates) < 2:
         raise UserError(f"an item has {len(new.candidates)} candidates, but at least 2 can be compared")
     if new.best is not None and not 0 <= new.best < len(new.candidates):
@@ -208,14 +218,15 @@ def _add_item(connection: Connection, project: int, new: NewItem) -> bool:
         raise UserError("an item compares a candidate with itself: two of its candidates are the same, and by the same maker")
     mark = hashlib.sha256(f"{prompt}:{sorted(candidates)}".encode()).hexdigest()
     thing = schema.item
-    if connection.execute(select(thing.c.id).where(thing.c.project_id == project, thing.c.fingerprint == mark)).scalar() is not None:
-        return False
+    found = connection.execute(select(thing.c.id).where(thing.c.project_id == project, thing.c.fingerprint == mark)).scalar()
+    if found is not None:
+        return found, False
     values = {"project_id": project, "prompt_id": prompt, "fingerprint": mark, "wanted": new.raters, "priority": new.priority}
     values |= {"best": new.best, "state": "open", "created": time.time()}
     number = connection.execute(insert(thing).values(values).returning(thing.c.id)).scalar_one()
     rows = [{"item_id": number, "position": position, "candidate_id": each} for position, each in enumerate(candidates)]
     connection.execute(insert(schema.item_candidate), rows)
-    return True
+    return number, True
 
 
 def _find_or_add(connection: Connection, table: Table, keys: Sequence[str], values: Mapping[str, object]) -> int:
