@@ -10,12 +10,13 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PYGAME_HIDE_SUPPORT_PROMPT := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-slow bench format clean
+.PHONY: help install demo browser test test-slow opponents bench format clean
 
 help:
 	@echo "make demo       train PPO on CartPole-v1 with 8 seeds, evaluate, plot and film it"
 	@echo "make test       linter, formatter check, type checker, tests"
 	@echo "make test-slow  the learning tests that take long"
+	@echo "make opponents  install what agents are measured against into .venv-opponents"
 	@echo "make bench      measure against other libraries, write docs/performance.md"
 	@echo "make format     format the code and mend what the linter can"
 	@echo "make clean      remove .venv, caches and build files (runs/ stays)"
@@ -46,13 +47,22 @@ demo: $(STAMP)
 	@$(BIN)/thorndike plot latest --output $(RUNS)
 	@$(BIN)/thorndike watch latest --output $(RUNS) --video $(RUNS)/demo.mp4
 
-test: $(STAMP)
+# The studio is tested in a browser; where there is none and none can be installed, those tests say so and are skipped.
+browser:
+	@command -v chromium >/dev/null || command -v chromium-browser >/dev/null || command -v google-chrome >/dev/null || \
+	  if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+	    echo "installing chromium, in which the studio is tested"; \
+	    { apt-get update -qq && DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends chromium; } >/dev/null 2>&1 || \
+	      echo "chromium could not be installed: the tests in a browser are skipped" >&2; \
+	  else echo "no chromium here: the tests in a browser are skipped; type: sudo apt-get install chromium" >&2; fi
+
+test: $(STAMP) browser
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy
 	@$(BIN)/pytest -q -n auto --dist loadfile -m "not slow"
 
-test-slow: $(STAMP)
+test-slow: $(STAMP) browser
 	@$(BIN)/pytest -q -m slow
 
 # PyTorch's CPU build where there is one, else what the registry has: the peers run on the CPU either way.
@@ -61,6 +71,14 @@ test-slow: $(STAMP)
 	.venv-peers/bin/python -m pip install --quiet torch==2.13.0+cpu || .venv-peers/bin/python -m pip install --quiet torch==2.13.0
 	grep -v '^torch==' benchmarks/peers.txt > .venv-peers/peers.txt
 	.venv-peers/bin/python -m pip install --quiet -r .venv-peers/peers.txt
+	@touch $@
+
+# Programs that nobody here wrote, to play against; each runs in a process of its own.
+opponents: .venv-opponents/.installed
+
+.venv-opponents/.installed: benchmarks/opponents.txt
+	$(PYTHON) -m venv .venv-opponents
+	.venv-opponents/bin/python -m pip install --quiet -r benchmarks/opponents.txt
 	@touch $@
 
 bench: $(STAMP) .venv-peers/.installed

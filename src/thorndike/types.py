@@ -9,6 +9,8 @@ from typing import NamedTuple, TypeAlias
 import gymnasium
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
+from thorndike.games.game import Game
+
 Observation: TypeAlias = PyTree
 """An array ``[B, ...]``, or a dict/tuple of them. Its entry ``action_mask``, if it has one, says which actions are allowed."""
 
@@ -104,6 +106,8 @@ class EnvSpec(NamedTuple):
     """For hindsight; None where there are no goals, or where no compiled program can judge them."""
     frames: int = 1
     """How many successive frames an observation holds on its last axis, the newest last: replay stores each once."""
+    game: Game | None = None
+    """The rules, where the environment is a game of players who move in turn: what a search looks ahead with."""
 
 
 class Environment(NamedTuple):

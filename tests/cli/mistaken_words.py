@@ -62,7 +62,20 @@ OTHER_FLAGS = [
     "metric",
 ]
 OTHER_FLAGS += ["against", "failed-below", "plot", "file", "title", "video", "window", "stochastic", "eval-episodes", "n-timesteps"]
-OTHER_FLAGS += ["total-steps", "start-from", "deterministic", "random-share", "to", "data", "methods", "gamma", "fqe-steps"]
+OTHER_FLAGS += [
+    "total-steps",
+    "start-from",
+    "deterministic",
+    "random-share",
+    "to",
+    "data",
+    "methods",
+    "gamma",
+    "fqe-steps",
+    "port",
+    "open",
+    "host",
+]
 NO_NUMBERS = [
     "",
     " ",

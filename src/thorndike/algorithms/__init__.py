@@ -2,6 +2,8 @@
 
 from typing import NamedTuple
 
+from thorndike.errors import UserError
+
 
 class Entry(NamedTuple):
     """Where an algorithm lives and what it is, in one line."""
@@ -18,6 +20,8 @@ class Entry(NamedTuple):
     """Whether a network of the user's own can take the place of its own."""
     learns_from: tuple[str, ...] = ("environment",)
     """``environment``, ``dataset``, or both."""
+    plays: bool = False
+    """Whether it learns games of two by playing itself, and nothing else."""
 
 
 ALGORITHMS: dict[str, Entry] = {
@@ -121,6 +125,14 @@ ALGORITHMS: dict[str, Entry] = {
         tabular=True,
         network=False,
     ),
+    "alphazero": Entry(
+        "thorndike.algorithms.alphazero",
+        "AlphaZero: a network and a tree search that learn a game of two by playing themselves; games",
+        ("Discrete",),
+        num_envs=256,
+        network=False,
+        plays=True,
+    ),
     "planning": Entry(
         "thorndike.algorithms.planning",
         "Value iteration, policy iteration, evaluation, finite horizon on a known model",
@@ -130,3 +142,14 @@ ALGORITHMS: dict[str, Entry] = {
     ),
 }
 """Name on the command line -> entry. A new algorithm is one more line here."""
+
+
+def check_plays(algorithm: str, environment: str, of_two: bool) -> None:
+    """Raises UserError if an algorithm for games is to learn something else, or another one a game ``of_two``, whose rewards take turns."""
+    players = [name for name, entry in ALGORITHMS.items() if entry.plays]
+    if ALGORITHMS[algorithm].plays and not of_two:
+        raise UserError(f"{algorithm} learns games of two players, such as connect_four, and {environment} is none: train it with ppo")
+    if of_two and not ALGORITHMS[algorithm].plays:
+        raise UserError(
+            f"{environment} is a game of two players: train {' or '.join(players)} on it, which play themselves, not {algorithm}"
+        )

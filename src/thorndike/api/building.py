@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias, cast
 import gymnasium
 
 from thorndike import startup
-from thorndike.algorithms import ALGORITHMS
+from thorndike.algorithms import ALGORITHMS, check_plays
 from thorndike.environments import registry, wrappers
 from thorndike.environments.native.vectorize import Dynamics
 from thorndike.errors import UserError
+from thorndike.games.game import Game
 from thorndike.learning_sources import check_source
 from thorndike.networks.network import NetworkBuilder
 from thorndike.networks.torso import is_image
@@ -37,7 +38,7 @@ from thorndike.types import Algorithm, Environment, EnvSpec, Source, Wrapper
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-EnvironmentLike: TypeAlias = str | gymnasium.Env | Callable[..., gymnasium.Env] | gymnasium.vector.VectorEnv | Environment | Dynamics
+EnvironmentLike: TypeAlias = str | gymnasium.Env | Callable[..., gymnasium.Env] | gymnasium.vector.VectorEnv | Environment | Dynamics | Game
 
 NO_THREADS = ActorThreads()
 _MOST_THREADS = 1_000
@@ -161,6 +162,7 @@ def build_algorithm(name: str, config: Mapping[str, object], spec: EnvSpec, netw
 
 def build_from_config(name: str, settings: "DataclassInstance", spec: EnvSpec, network: NetworkBuilder | None) -> Algorithm:
     """The same from a ``Config``, whose numbers may be traced. Raises ``UserError`` if they do not fit."""
+    check_plays(name, spec.id, spec.game is not None and spec.game.num_players == 2)
     factory = getattr(importlib.import_module(ALGORITHMS[name].module), name)
     if network is None:
         return factory(settings, spec)

@@ -6,9 +6,11 @@ from typing import cast
 import jax
 import jax.numpy as jnp
 
+from thorndike.algorithms import ALGORITHMS
 from thorndike.api.building import build_algorithm
 from thorndike.environments.wrappers import from_settings
 from thorndike.errors import UserError
+from thorndike.games.registry import game
 from thorndike.networks.network import NetworkBuilder
 from thorndike.records import from_policy, read_policy_facts
 from thorndike.training.json_files import Json, blamed_on
@@ -42,7 +44,9 @@ def _parts(facts: Json, network: NetworkBuilder | None) -> tuple[Algorithm, Wrap
     wrapper = from_settings(cast(list[Json], facts["wrappers"]))
     observations, actions = (space_from_json(cast(Json, facts[part])) for part in ("observation_space", "action_space"))
     limit = cast(int | None, facts["max_episode_steps"])
-    spec = EnvSpec(cast(str, facts["environment"]), observations, actions, num_envs=cast(int, facts["num_envs"]), max_episode_steps=limit)
+    environment, num_envs = cast(str, facts["environment"]), cast(int, facts["num_envs"])
+    rules = game(environment) if ALGORITHMS[name].plays else None
+    spec = EnvSpec(environment, observations, actions, num_envs=num_envs, max_episode_steps=limit, game=rules)
     return build_algorithm(name, config, wrapper.spec(spec), network), wrapper, spec
 
 

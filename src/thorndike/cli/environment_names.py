@@ -6,11 +6,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from thorndike.algorithms import ALGORITHMS
+from thorndike.algorithms import ALGORITHMS, check_plays
 from thorndike.cli.find_run import is_file
 from thorndike.environments.host.envpool_ids import pool_ids
 from thorndike.environments.native import NATIVE
 from thorndike.errors import UserError
+from thorndike.games.registry import game_ids, is_game
 from thorndike.suggestions import nearest
 
 if TYPE_CHECKING:
@@ -54,6 +55,9 @@ def _check_place(name: str) -> None:
 def _check_actions(algorithm: str, choice: "Choice") -> None:
     """Raises UserError if the algorithm does not take the environment's actions. Asked of Gymnasium's, which needs no JAX."""
     fitting, name = ALGORITHMS[algorithm].actions, choice.id
+    if ALGORITHMS[algorithm].plays or is_game(name):
+        check_plays(algorithm, name, is_game(name) and ALGORITHMS[algorithm].plays)
+        return
     # All MinAtar games have Discrete actions; to ask their package would import Matplotlib and pandas.
     if not fitting or (name.startswith("MinAtar/") and "Discrete" in fitting and algorithm != "planning"):
         return
@@ -79,4 +83,4 @@ def _ids_in_the_text() -> frozenset[str] | None:
         return None
     package = Path(spec.origin).parent
     own = re.findall(r'^\s*id="([^"]+)"', (package / "envs" / "__init__.py").read_text(encoding="utf-8"), re.MULTILINE)
-    return frozenset(own) | set(NATIVE) | pool_ids() if own else None
+    return frozenset(own) | set(NATIVE) | set(game_ids()) | pool_ids() if own else None

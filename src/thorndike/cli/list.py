@@ -11,6 +11,7 @@ from thorndike.cli.parser import Parser
 from thorndike.cli.tables import mean, table
 from thorndike.config_fields import read_config_fields
 from thorndike.errors import UserError
+from thorndike.games.registry import game_ids
 from thorndike.settings import describe_kind
 from thorndike.suggestions import did_you_mean
 
@@ -66,11 +67,12 @@ def _environments() -> Answer:
     probes = [name for name in NATIVE if name.startswith("probe/")]
     pool = sorted(pool_ids()) if pool_is_installed() else []
     host = sorted(set(gymnasium.registry) - set(native))
-    groups: dict[str, object] = {"native": native, "probes": probes, "gymnasium": host, "envpool": pool}
+    groups: dict[str, object] = {"native": native, "games": list(game_ids()), "probes": probes, "gymnasium": host, "envpool": pool}
     text = "\n".join(
         [
             f"compiled: {', '.join(native)},",
             "  and every Gymnasium environment with a transition table, such as FrozenLake-v1, CliffWalking-v1, Taxi-v4",
+            f"games of two players, which play themselves: {', '.join(game_ids())}",
             f"probes, which tell whether a learner is right: {', '.join(probes)}",
             f"Gymnasium: {', '.join(host)}",
             f"EnvPool: {len(pool)} ids, listed by --json" if pool else "EnvPool: not installed: pip install 'thorndike[pool]'",

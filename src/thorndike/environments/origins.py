@@ -7,10 +7,8 @@ import copy
 import importlib
 import importlib.metadata
 import importlib.util
-import sys
 import warnings
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from types import ModuleType
 from typing import TypeAlias
 
@@ -21,9 +19,12 @@ from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 
 from thorndike.environments.host.atari import atari_settings, is_preprocessed
 from thorndike.errors import UserError
+from thorndike.user_code import attribute_in_file, import_module, load_file, one_line
 
 Settings: TypeAlias = Mapping[str, object]
 """Keyword settings of an environment."""
+
+_IN_A_FILE = "path/to/file.py:ClassName"
 
 gymnasium.register("DeepSea-v0", "thorndike.environments.deep_sea:DeepSeaEnv")
 
@@ -32,7 +33,7 @@ def is_known_id(name: str) -> bool:
     """Whether Gymnasium has this id, after importing the module of ``module:Id`` or the package of ``ALE/...`` or ``MinAtar/...``."""
     module, _, id = name.rpartition(":")
     if module:
-        _import(module, name)
+        import_module(module, name, _IN_A_FILE)
     elif id.startswith("ALE/") and importlib.util.find_spec("ale_py") is not None:
         package = importlib.import_module("ale_py")
         gymnasium.register_envs(package)
@@ -145,19 +146,18 @@ def frames_of(environment: gymnasium.Env) -> int:
     return int(getattr(environment.unwrapped, "frames_stacked", 1))
 
 
-def class_in_file(name: str) -> tuple[Path, str] | None:
-    """The parts of ``path/to/file.py:ClassName``, or None if `name` has not that form."""
-    path, _, attribute = name.rpartition(":")
-    return (Path(path), attribute) if path.endswith(".py") else None
-
-
 def _from_name(name: str, env_kwargs: Settings, max_episode_steps: int | None, render_mode: str | None) -> gymnasium.Env:
-    in_file = class_in_file(name)
+    in_file = attribute_in_file(name)
     if in_file is not None:
-        return _limited(_called(_attribute(_load(in_file[0]), in_file[1], name), env_kwargs, render_mode, name), max_episode_steps)
+        return _limited(
+            _called(_attribute(load_file(in_file[0], "the environment's class"), in_file[1], name), env_kwargs, render_mode, name),
+            max_episode_steps,
+        )
     module, _, id = name.rpartition(":")
     if not is_known_id(name) and module:
-        return _limited(_called(_attribute(_import(module, name), id, name), env_kwargs, render_mode, name), max_episode_steps)
+        return _limited(
+            _called(_attribute(import_module(module, name, _IN_A_FILE), id, name), env_kwargs, render_mode, name), max_episode_steps
+        )
     missing = missing_package(id)
     if missing is not None:
         raise UserError(missing)
@@ -176,7 +176,7 @@ def _from_name(name: str, env_kwargs: Settings, max_episode_steps: int | None, r
             made = gymnasium.make(id, max_episode_steps=max_episode_steps, disable_env_checker=True, **settings)
     except Exception as error:
         # Whatever an environment's constructor raises is about what was asked of it.
-        raise UserError(f"Gymnasium cannot make {name}: {type(error).__name__}: {_one_line(error)}") from error
+        raise UserError(f"Gymnasium cannot make {name}: {type(error).__name__}: {one_line(error)}") from error
     if id.startswith("MinAtar/") and render_mode == "rgb_array":
         from thorndike.environments.magnified import Magnified
 
@@ -193,7 +193,7 @@ def _called(make: Callable[..., gymnasium.Env], env_kwargs: Settings, render_mod
     except Exception as error:
         hint = "; give it a render_mode argument, as Gymnasium's environments have, to watch it" if render_mode is not None else ""
         raise UserError(
-            f"{name} cannot be made with {settings or 'no settings'}: {type(error).__name__}: {_one_line(error)}{hint}"
+            f"{name} cannot be made with {settings or 'no settings'}: {type(error).__name__}: {one_line(error)}{hint}"
         ) from error
     if not isinstance(environment, gymnasium.Env):
         raise UserError(f"{name} must give a gymnasium.Env, not {type(environment).__name__}")
@@ -207,7 +207,7 @@ def _copy(environment: gymnasium.Env, env_kwargs: Settings, render_mode: str | N
         copied = copy.deepcopy(environment)
     except (TypeError, ValueError, NotImplementedError, RuntimeError) as error:
         raise UserError(
-            f"{name_of(environment)} cannot be copied ({_one_line(error)}): give a function that makes one, such as lambda: MyEnv(...)"
+            f"{name_of(environment)} cannot be copied ({one_line(error)}): give a function that makes one, such as lambda: MyEnv(...)"
         ) from error
     if render_mode is not None:
         copied.unwrapped.render_mode = render_mode
@@ -223,37 +223,6 @@ def _limited(environment: gymnasium.Env, max_episode_steps: int | None) -> gymna
     return TimeLimit(environment, max_episode_steps)
 
 
-def _load(path: Path) -> ModuleType:
-    if not path.is_file():
-        raise UserError(f"there is no file {path}: give the path of the file that defines the environment's class")
-    name = f"thorndike_user_{path.stem}"
-    known = sys.modules.get(name)
-    if known is not None and known.__file__ == str(path.resolve()):
-        return known
-    spec = importlib.util.spec_from_file_location(name, path.resolve())
-    if spec is None or spec.loader is None:
-        raise UserError(f"{path} is not a Python file: give the path of the file that defines the environment's class")
-    module = importlib.util.module_from_spec(spec)
-    # Registered so that the class can be pickled and copied.
-    sys.modules[name] = module
-    try:
-        spec.loader.exec_module(module)
-    except (Exception, SystemExit) as error:
-        del sys.modules[name]
-        raise UserError(f"{path} cannot be imported: {type(error).__name__}: {_one_line(error)}") from error
-    return module
-
-
-def _import(module: str, name: str) -> ModuleType:
-    try:
-        return importlib.import_module(module)
-    except ModuleNotFoundError as error:
-        raise UserError(f"cannot import {module} of {name}: {_one_line(error)}; install it, or give path/to/file.py:ClassName") from error
-    except (Exception, SystemExit) as error:
-        # Whatever a module raises, or its name, is about what was asked for.
-        raise UserError(f"{module} of {name} cannot be imported: {type(error).__name__}: {_one_line(error)}") from error
-
-
 def _attribute(module: ModuleType, attribute: str, name: str) -> Callable[..., gymnasium.Env]:
     found = getattr(module, attribute, None)
     if not callable(found):
@@ -262,7 +231,3 @@ def _attribute(module: ModuleType, attribute: str, name: str) -> Callable[..., g
         classes = [key for key, value in vars(module).items() if isinstance(value, type) and issubclass(value, gymnasium.Env)]
         raise UserError(f"{name}: no environment {attribute!r} there{did_you_mean(attribute, classes)}")
     return found
-
-
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split())

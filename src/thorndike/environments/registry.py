@@ -2,6 +2,7 @@
 
 The order, with ``engine="auto"``:
 
+0. ``native``: a game (``games/registry.py``), which plays itself; it is evaluated against an opponent.
 1. ``native``: an id of ``native.NATIVE`` whose factory takes the settings given, or any Gymnasium environment with a transition table
    (``unwrapped.P``) around which nothing but Gymnasium's own checks and time limit is wrapped.
 2. ``envpool``: an id that means the same task in EnvPool and Gymnasium (``host/envpool_ids.py`` says how that was found), or that only
@@ -22,6 +23,8 @@ from thorndike.environments.host.atari import PREFIX, atari_settings, episode_li
 from thorndike.environments.host.envpool_ids import SAME_AS_GYMNASIUM, pool_ids, pool_is_installed
 from thorndike.environments.native import NATIVE, factory, is_only_native, settings_of
 from thorndike.errors import UserError
+from thorndike.games.registry import game, game_ids, is_game
+from thorndike.games.settings import game_settings
 from thorndike.suggestions import did_you_mean, nearest
 
 if TYPE_CHECKING:
@@ -34,10 +37,11 @@ if TYPE_CHECKING:
     from thorndike.environments.host.subprocess_engine import SubprocessEngine
     from thorndike.environments.host.vector_engine import VectorEngine
     from thorndike.environments.native.vectorize import Dynamics
+    from thorndike.games.game import Game
     from thorndike.types import Environment
 
     HostEngine: TypeAlias = LoopEngine | SubprocessEngine | VectorEngine | EnvPoolEngine | AleEngine
-    Named: TypeAlias = str | gymnasium.Env | Callable[..., gymnasium.Env] | VectorEnv | Environment | Dynamics
+    Named: TypeAlias = str | gymnasium.Env | Callable[..., gymnasium.Env] | VectorEnv | Environment | Dynamics | Game
 
 ENGINES = ("auto", "native", "gymnasium", "subprocess", "envpool", "ale")
 NO_SETTINGS: Mapping[str, object] = MappingProxyType({})
@@ -81,10 +85,15 @@ def resolve(
 def build_native(choice: Choice, num_envs: int) -> "Environment":
     """The compiled batch. Raises UserError if the engine is another, or an Environment was given with another number of environments."""
     from thorndike.environments.native.vectorize import Dynamics, vectorize
+    from thorndike.games.environment import game_environment
     from thorndike.types import Environment
 
     if choice.engine != "native":
         raise UserError(f"{choice.id} runs on the {choice.engine} engine, which is not compiled: build it with build_host")
+    rules = game_of(choice)
+    if rules is not None:
+        environment = game_environment(rules, num_envs, game_settings(choice.id, choice.env_kwargs))
+        return environment._replace(spec=environment.spec._replace(id=choice.id))
     if not isinstance(choice.origin, Environment):
         dynamics = choice.origin if isinstance(choice.origin, Dynamics) else _dynamics(choice)
         return vectorize(dynamics, num_envs, choice.max_episode_steps)
@@ -93,6 +102,15 @@ def build_native(choice: Choice, num_envs: int) -> "Environment":
     if choice.max_episode_steps not in (None, choice.origin.spec.max_episode_steps):
         raise UserError(f"{choice.id} is built already: give max_episode_steps where it is built")
     return choice.origin
+
+
+def game_of(choice: Choice) -> "Game | None":
+    """The rules, where what was named is a game."""
+    from thorndike.games.game import Game
+
+    if isinstance(choice.origin, Game):
+        return choice.origin
+    return game(choice.origin) if choice.engine == "native" and isinstance(choice.origin, str) and is_game(choice.origin) else None
 
 
 def build_host(choice: Choice, num_envs: int, masks: bool = False, env_timeout: float | None = None) -> "HostEngine":
@@ -139,10 +157,13 @@ def build_host(choice: Choice, num_envs: int, masks: bool = False, env_timeout: 
 def reference(choice: Choice, render_mode: str | None = None) -> "gymnasium.Env":
     """One fresh Gymnasium environment of what was named, for evaluation and video, whatever engine trains.
 
-    Where Gymnasium has none (a probe, an id of EnvPool alone), that engine in Gymnasium's form.
+    Where Gymnasium has none (a probe, an id of EnvPool alone), that engine in Gymnasium's form; of a game, one against an opponent.
     """
     from thorndike.environments.origins import VectorEnv, make_single
 
+    rules = game_of(choice)
+    if rules is not None:
+        return _against_opponent(choice, rules, render_mode)
     if isinstance(choice.origin, VectorEnv):
         makers = getattr(choice.origin.unwrapped, "env_fns", None)
         if not makers:
@@ -161,6 +182,14 @@ def reference(choice: Choice, render_mode: str | None = None) -> "gymnasium.Env"
     return make_single(choice.origin, choice.env_kwargs, choice.max_episode_steps, render_mode)
 
 
+def _against_opponent(choice: Choice, rules: "Game", render_mode: str | None) -> "gymnasium.Env":
+    from thorndike.games.against import AgainstOpponent
+
+    if render_mode is not None:
+        raise UserError(f"{choice.id} is a game, which is watched by playing: thorndike play {choice.id}")
+    return AgainstOpponent(rules, game_settings(choice.id, choice.env_kwargs))
+
+
 def environment_ids() -> dict[str, list[str]]:
     """Every id by the engine that ``auto`` would choose; tables count as ``gymnasium`` here, for they are known only once made."""
     from thorndike.environments.origins import gymnasium, starts_here
@@ -168,7 +197,7 @@ def environment_ids() -> dict[str, list[str]]:
     pool = sorted(id for id in _automatic_pool_ids() if starts_here(id))
     taken = {*NATIVE, *pool}
     return {
-        "native": sorted(NATIVE),
+        "native": sorted({*NATIVE, *game_ids()}),
         "envpool": pool,
         "gymnasium": sorted(id for id in gymnasium.registry if id not in taken and not id.startswith("GymV")),
     }
@@ -176,6 +205,11 @@ def environment_ids() -> dict[str, list[str]]:
 
 def _engine_of_name(name: str, engine: str, settings: dict[str, object]) -> str:
     """The engine of an id; raises UserError if nobody has it or the engine asked for does not."""
+    if is_game(name):
+        if engine not in ("auto", "native"):
+            raise UserError(f"{name} is a game, which is compiled: leave engine={engine!r} out")
+        game_settings(name, settings)
+        return "native"
     if engine in ("auto", "native") and name in NATIVE and _accepts(name, settings):
         return "native"
     if name.startswith(PREFIX):
@@ -216,8 +250,12 @@ def _engine_of_atari(name: str, engine: str, settings: dict[str, object]) -> str
 def _resolve_object(environment: "Named", engine: str, settings: dict[str, object], max_episode_steps: int | None) -> Choice:
     from thorndike.environments.native.vectorize import Dynamics
     from thorndike.environments.origins import VectorEnv, name_of
+    from thorndike.games.game import Game
     from thorndike.types import Environment
 
+    if isinstance(environment, Game) and engine in ("auto", "native"):
+        game_settings(environment.id, settings)
+        return Choice(environment.id, "native", environment, settings, max_episode_steps)
     if isinstance(environment, Environment | Dynamics):
         if engine not in ("auto", "native") or settings:
             raise UserError("a native environment runs on engine='native' and has its settings already: leave both out")
@@ -304,9 +342,10 @@ def _accepts(id: str, settings: dict[str, object]) -> bool:
 
 
 def _gymnasium_has(name: str) -> bool:
-    from thorndike.environments.origins import class_in_file, is_known_id
+    from thorndike.environments.origins import is_known_id
+    from thorndike.user_code import attribute_in_file
 
-    if class_in_file(name) is not None or is_known_id(name):
+    if attribute_in_file(name) is not None or is_known_id(name):
         return True
     # ``module:ClassName``: the module is there; whether the class is, making it says.
     return ":" in name
@@ -330,7 +369,7 @@ def _automatic_pool_ids() -> frozenset[str]:
 def _unknown(name: str, engine: str) -> str:
     from thorndike.environments.origins import gymnasium, missing_package
 
-    close = nearest(name, {*NATIVE, *pool_ids(), *gymnasium.registry})
+    close = nearest(name, {*NATIVE, *game_ids(), *pool_ids(), *gymnasium.registry})
     missing = missing_package(name)
     if missing is not None and (close == name or name.startswith("ALE/")):
         return missing

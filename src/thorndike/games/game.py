@@ -36,6 +36,8 @@ class Board(NamedTuple):
     """The squares clicked one after another -> the legal action that they mean: one to place a piece, two to move one."""
     buttons: Mapping[str, int]
     """Legal actions that are no click on the board, by name: ``pass``."""
+    caption: str = ""
+    """What no square shows: the dice."""
 
 
 class Game(NamedTuple):
@@ -84,6 +86,8 @@ class Choice(NamedTuple):
     principal_variation: tuple[int, ...] = ()
     """The line that the player expects, beginning with ``action``."""
     resigns: bool = False
+    remark: str = ""
+    """What people should know: why it resigns, that it broke a rule."""
 
 
 class Turn(NamedTuple):

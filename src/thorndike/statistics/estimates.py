@@ -73,8 +73,8 @@ def bootstrap_values(scores: ArrayLike, statistic: Statistic, resamples: int = R
     return np.concatenate(values)
 
 
-def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
-    """Wilson's score interval of a success rate: right for few trials and for rates near 0 and 1.
+def wilson_interval(successes: float, trials: int, confidence: float = 0.95) -> tuple[float, float]:
+    """Wilson's score interval of a success rate: right for few trials and for rates near 0 and 1. Half successes may count too (draws).
 
     Raises UserError unless ``0 <= successes <= trials`` and ``trials >= 1``. Source: Wilson 1927, JASA 22, 209-212.
     """

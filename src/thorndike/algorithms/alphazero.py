@@ -1,0 +1,235 @@
+"""AlphaZero: a network learns a game of two from nothing but playing itself, guided by a tree search that it guides.
+
+Silver et al. 2018, "A general reinforcement learning algorithm that masters chess, shogi, and Go through self-play" (Science 362);
+Gumbel: Danihelka et al. 2022, "Policy improvement by planning with Gumbel"; playout caps: Wu 2019, KataGo (arXiv:1902.10565).
+Deviations from Silver et al.:
+
+1. The search may be Gumbel's (the default), whose policy improves even with few simulations. No tree is used again for the next move.
+2. Only a share of the moves (``full_search_fraction``) is searched in full and teaches the policy; the others are fast ones, without noise
+   (KataGo). All games of the batch search together, so the coin is thrown once a step for all of them.
+3. A share of the games begins with random moves (``games/environment.py``), for else the network knows nothing off its own paths.
+4. The value is a logit of winning, a draw counted as half, learnt by cross-entropy in place of squared error.
+5. What plays, and is exported, is a running average of the learnt parameters (``averaging``), always the latest: nothing is gated.
+6. AdamW in place of momentum, with gradients clipped. Learning alternates with a few moves of all games.
+7. Symmetries of the board turn what is learnt from, a minibatch in equal parts, and not what is searched.
+
+Rewards are the mover's: ``rollout/ep_rew_mean`` is the share of games that were won by either. Logs ``train/loss``, ``policy_loss``,
+``value_loss``, ``policy_kl`` (the loss less the target's entropy), ``known_outcomes``, ``grad_norm``, ``learning_rate`` and, of positions
+in games played on, ``resign_checks``: the share in which the mover would have resigned, ``resign_errors``: and yet did not lose. Results:
+docs/algorithms/alphazero.md.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Annotated, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float, Int, Key, PyTree
+
+from thorndike.errors import UserError
+from thorndike.functional.guards import accept_if, all_finite
+from thorndike.functional.learning_dynamics import mean_square_gradient
+from thorndike.functional.policy_losses import weighted_mean
+from thorndike.functional.schedules import schedule
+from thorndike.games.game import Game, Position
+from thorndike.games.packing import packing
+from thorndike.games.search import SEARCHES, Evaluate, Found, SearchSettings, search
+from thorndike.games.self_play import Batch, Manners, as_batch, draw_moves, false_resignations, fresh_memory, move, players
+from thorndike.networks.board import TOWERS, board_network, win_value
+from thorndike.networks.hidden_layers import look_into
+from thorndike.networks.masking import FORBIDDEN, MASK
+from thorndike.networks.network import Network
+from thorndike.replay.age import key_to_look_by
+from thorndike.replay.self_play import Rows, SelfPlayBuffer, add_self_play, init_self_play, sample_self_play
+from thorndike.settings import AtLeast, Between, MoreThan, OneOf, check
+from thorndike.types import Algorithm, EnvSpec, Metrics, Needs, Noise, Observation, Rollout
+
+
+@dataclass(frozen=True)
+class Config:
+    """Settings of AlphaZero, for small boards on a CPU."""
+
+    total_steps: Annotated[int, AtLeast(1)] = 100_000  # moves of the run, the measure of the schedule
+    learning_rate: Annotated[float | str, AtLeast(0)] = 1e-3  # AdamW's step size, or a schedule such as linear(1e-3, 1e-4)
+    n_steps: Annotated[int, AtLeast(1)] = 8  # T: moves of each game between two rounds of learning
+    batch_size: Annotated[int, AtLeast(1)] = 512  # positions of a minibatch
+    gradient_steps: Annotated[int, AtLeast(1)] = 16  # minibatches of a round
+    buffer_size: Annotated[int, AtLeast(1)] = 200_000  # the window: positions that are learnt from
+    learning_starts: Annotated[int, AtLeast(0)] = 20_000  # positions before learning starts
+    search: Annotated[str, OneOf(*SEARCHES)] = "gumbel"  # at the root: Gumbel's sequential halving, or PUCT with Dirichlet noise
+    num_simulations: Annotated[int, AtLeast(1)] = 32  # of a full search
+    fast_simulations: Annotated[int, AtLeast(1)] = 12  # of a fast one, which teaches no policy
+    full_search_fraction: Annotated[float, Between(0, 1)] = 1.0  # p: share of full searches (KataGo's playout cap randomisation)
+    eval_simulations: Annotated[int, AtLeast(0)] = 64  # when playing for strength; 0: the network alone
+    considered_moves: Annotated[int, AtLeast(1)] = 16  # m of gumbel: moves tried at the root
+    value_scale: Annotated[float, MoreThan(0)] = 0.5  # c_scale of gumbel: weight of values in [-1, 1] against the prior
+    rescale_values: bool = False  # gumbel: stretch the values of a node's moves to [0, 1] first
+    c_puct: Annotated[float, MoreThan(0)] = 1.25  # c_init of puct: weight of the prior
+    dirichlet_alpha: Annotated[float, MoreThan(0)] = 1.0  # alpha of puct's noise at the root
+    dirichlet_fraction: Annotated[float, Between(0, 1)] = 0.25  # epsilon: its share of the prior there
+    temperature: Annotated[float, MoreThan(0)] = 1.0  # tau: of the first moves, drawn from the search's policy
+    temperature_moves: Annotated[int, AtLeast(0)] = 8  # moves of a game that are drawn; later ones are the search's best
+    resign_threshold: Annotated[float, Between(-1, 0)] = -1.0  # resign below this value; -1: never
+    resign_check_fraction: Annotated[float, Between(0, 1)] = 0.1  # share of games played on, to count resignations in error
+    symmetries: bool = True  # learn from turned and mirrored boards too
+    vf_coef: Annotated[float, AtLeast(0)] = 1.0  # weight of the value loss
+    weight_decay: Annotated[float, AtLeast(0)] = 1e-4  # c: of AdamW, decoupled
+    max_grad_norm: Annotated[float, MoreThan(0)] = 1.0  # global norm the gradient is clipped to
+    averaging: Annotated[float, MoreThan(0), Between(0, 1)] = 0.005  # how far what plays moves to the newest parameters at a step
+    tower: Annotated[str, OneOf(*TOWERS)] = "mlp"  # dense layers, dense layers on shared patches, or convolutions
+    width: Annotated[int, AtLeast(1)] = 256  # units of a dense layer, or channels
+    blocks: Annotated[int, AtLeast(0)] = 2  # residual blocks of two layers
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+class State(NamedTuple):
+    """What learning carries from one iteration to the next."""
+
+    params: PyTree
+    average: PyTree
+    """The running average of the parameters: what plays."""
+    opt_state: PyTree
+    buffer: SelfPlayBuffer
+    env_steps: Int[Array, ""]
+
+
+def alphazero_loss(params: PyTree, batch: Batch, network: Network, vf_coef: float) -> tuple[Float[Array, ""], Metrics]:
+    """Cross-entropy of the search's policy, and of the outcome as the probability of winning: the paper's eq. 1 with deviation 4."""
+    logits, win = network.apply(params, batch.board)
+    log_policy = jax.nn.log_softmax(jnp.where(batch.legal, logits, FORBIDDEN))
+    policy = weighted_mean(-jnp.sum(batch.policy * log_policy, axis=-1), batch.policy_weight)
+    value = weighted_mean(optax.sigmoid_binary_cross_entropy(win, 0.5 * (batch.outcome + 1.0)), batch.value_weight)
+    entropy = -jnp.sum(batch.policy * jnp.log(jnp.maximum(batch.policy, 1e-9)), axis=-1)
+    loss = policy + vf_coef * value
+    kl = policy - weighted_mean(entropy, batch.policy_weight)
+    return loss, {"train/loss": loss, "train/policy_loss": policy, "train/value_loss": value, "train/policy_kl": kl}
+
+
+def evaluator(game: Game, network: Network) -> Evaluate:
+    """The network as a search asks it."""
+
+    def evaluate(params: PyTree, positions: Position, key: Key[Array, ""]) -> tuple[Float[Array, "B actions"], Float[Array, " B"]]:
+        del key
+        logits, win = network.apply(params, jax.vmap(game.observe)(positions))
+        return logits, win_value(win)
+
+    return evaluate
+
+
+def alphazero(config: Config, spec: EnvSpec) -> Algorithm:
+    """AlphaZero for a game. Raises ``UserError`` for an environment that is no game of two players without dice."""
+    game = spec.game
+    if game is None or game.num_players != 2 or game.has_chance:
+        raise UserError(f"alphazero plays games of two players without dice (connect_four, ...), which {spec.id} is not: train it with ppo")
+    network, whole = board_network(game.num_actions, config.tower, config.width, config.blocks), packing(game)
+    evaluate = evaluator(game, network)
+    rows, longest = config.n_steps * spec.num_envs, game.max_moves
+    ring = math.ceil(max(config.buffer_size, (config.n_steps + longest) * spec.num_envs) / rows) * config.n_steps
+    full, fast, strong = (
+        SearchSettings(
+            config.search,
+            simulations,
+            config.dirichlet_alpha,
+            config.dirichlet_fraction,
+            config.c_puct,
+            config.considered_moves,
+            config.value_scale,
+            config.rescale_values,
+        )
+        for simulations in (config.num_simulations, config.fast_simulations, max(config.eval_simulations, 1))
+    )
+    manners = Manners(
+        config.temperature,
+        config.temperature_moves,
+        config.resign_threshold,
+        config.resign_check_fraction,
+        config.full_search_fraction,
+    )
+    optimizer = optax.chain(
+        optax.clip_by_global_norm(config.max_grad_norm),
+        optax.scale_by_adam(),
+        optax.add_decayed_weights(config.weight_decay),
+    )
+    learning_rate = schedule(config.learning_rate)
+
+    def init(key: Key[Array, ""]) -> State:
+        params = network.init(key, jnp.zeros((1, *game.observation_shape)))
+        buffer = init_self_play(ring, spec.num_envs, whole.size, game.num_actions)
+        return State(params, jax.tree.map(jnp.copy, params), optimizer.init(params), buffer, jnp.zeros((), jnp.int32))
+
+    def look_ahead(params: PyTree, obs: Observation, noise: Noise) -> Found:
+        positions, key = jax.vmap(whole.unpack)(obs["position"]), noise["search"].numbers
+
+        def deep() -> Found:
+            return search(game, evaluate, full, params, positions, key, explore=True)
+
+        if config.full_search_fraction == 1:
+            return deep()
+        return jax.lax.cond(noise["full"].numbers, deep, lambda: search(game, evaluate, fast, params, positions, key, explore=False))
+
+    def act(params: PyTree, memory: PyTree, obs: Observation, noise: Noise) -> tuple[PyTree, PyTree, PyTree]:
+        found = look_ahead(params, obs, noise)
+        moved = move(found, memory, noise, manners)
+        weight = jnp.broadcast_to(noise["full"].numbers.astype(jnp.float32), moved.action.shape)
+        return moved.memory, moved.action, {"policy": found.policy, "policy_weight": weight, "resigns": moved.resigns}
+
+    def greedy(params: PyTree, memory: PyTree, obs: Observation, noise: Noise) -> tuple[PyTree, PyTree, PyTree]:
+        positions = jax.vmap(whole.unpack)(obs["position"])
+        if config.eval_simulations == 0:
+            logits, _ = network.apply(params, obs["board"])
+            return memory, jnp.argmax(jnp.where(obs[MASK] > 0, logits, FORBIDDEN), axis=-1).astype(jnp.int32), {}
+        return memory, search(game, evaluate, strong, params, positions, noise["search"].numbers, explore=False).action, {}
+
+    def remember(state: State, rollout: Rollout) -> State:
+        step, extras, positions = rollout.step, rollout.extras, rollout.obs["position"]
+        nothing = jnp.zeros(step.reward.shape)
+        new = Rows(positions, players(game, positions), extras["policy"], extras["policy_weight"], nothing, nothing > 0, extras["resigns"])
+        buffer = add_self_play(state.buffer, new, step.reward, step.done, longest)
+        return state._replace(buffer=buffer, env_steps=state.env_steps + rows)
+
+    def learn(state: State, key: Key[Array, ""]) -> tuple[State, Metrics]:
+        sampled = sample_self_play(state.buffer, key, config.batch_size)
+        batch = as_batch(game, sampled, config.symmetries)
+        (_, metrics), grads = jax.value_and_grad(alphazero_loss, has_aux=True)(state.params, batch, network, config.vf_coef)
+        rate = learning_rate(state.env_steps / config.total_steps)
+        direction, opt_state = optimizer.update(grads, state.opt_state, state.params)
+        metrics |= {"train/grad_norm": optax.tree.norm(grads), "train/learning_rate": rate}
+        metrics["train/known_outcomes"] = jnp.mean(batch.value_weight)
+        metrics["train/resign_checks"], metrics["train/resign_errors"] = false_resignations(sampled)
+        params = jax.tree.map(lambda p, d: p - rate * d, state.params, direction)
+        average = jax.tree.map(lambda a, p: a + config.averaging * (p - a), state.average, params)
+        sound = all_finite(metrics["train/loss"], metrics["train/grad_norm"])
+        kept = accept_if(sound, (params, average, opt_state), (state.params, state.average, state.opt_state))
+        return state._replace(params=kept[0], average=kept[1], opt_state=kept[2]), metrics
+
+    def update(state: State, rollout: Rollout, key: Key[Array, ""]) -> tuple[State, Metrics]:
+        state = remember(state, rollout)
+        state, metrics = jax.lax.scan(learn, state, jax.random.split(key, config.gradient_steps))
+        return state, {name: jnp.mean(values) for name, values in metrics.items()}
+
+    def dynamics(state: State, rollout: PyTree) -> Metrics:
+        seen = as_batch(game, sample_self_play(state.buffer, key_to_look_by(state.env_steps), config.batch_size), symmetries=False)
+        age = spec.num_envs * (jnp.maximum(state.buffer.size, 1) - 1).astype(jnp.float32) / 2.0
+        looked = look_into(network, state.params, seen.board, mean_square_gradient(state.opt_state))
+        return looked | {"train/replay_age": age}
+
+    return Algorithm(
+        init=init,
+        actor=lambda state: state.average,
+        memory=fresh_memory,
+        draw=lambda key, steps: draw_moves(key, steps, spec.num_envs, game.num_actions, manners),
+        act=act,
+        greedy=greedy,
+        value=lambda params, obs: win_value(network.apply(params, obs["board"])[1]),
+        update=update,
+        observe=lambda state, rollout, key: (remember(state, rollout), {}),
+        needs=Needs(rollout_length=config.n_steps, on_policy=False, warmup_iterations=math.ceil(config.learning_starts / rows)),
+        probabilities=lambda params, memory, obs: jax.nn.softmax(
+            jnp.where(obs[MASK] > 0, network.apply(params, obs["board"])[0], FORBIDDEN)
+        ),
+        dynamics=dynamics,
+    )

@@ -1,0 +1,40 @@
+"""What players are called on a command line, checked before anything heavy is imported."""
+
+from collections.abc import Iterable
+
+from thorndike.errors import UserError
+from thorndike.games.engines import ENGINES, PROTOCOLS, check_engine, is_engine, read_settings
+from thorndike.suggestions import nearest
+
+RANDOM, MCTS = "random", "mcts"
+_OF_MCTS = {"simulations": (1, 1_000_000)}
+
+
+def known_players() -> tuple[str, ...]:
+    """By their short names."""
+    return (RANDOM, MCTS, *ENGINES)
+
+
+def is_run(text: str) -> bool:
+    """Whether a player's name is none of the short ones."""
+    return not (text == RANDOM or text.partition(":")[0] == MCTS or is_engine(text))
+
+
+def check_player(text: str, game: str, can_be_searched: bool) -> None:
+    """Raises UserError for a short name that cannot play. Whether a run is there is for others to say."""
+    if is_engine(text):
+        check_engine(text, game)
+    elif text.partition(":")[0] == MCTS:
+        mcts_simulations(text, 1)
+        if not can_be_searched:
+            raise UserError(f"mcts plays games of two players without dice, which {game} is not; here play random and trained runs")
+
+
+def mcts_simulations(text: str, default: int) -> int:
+    """Of ``mcts[:simulations=N]``. Raises UserError for other settings."""
+    return read_settings(MCTS, text.partition(":")[2], _OF_MCTS).get("simulations", default)
+
+
+def suggestion(text: str, runs: Iterable[str] = ()) -> str | None:
+    """The nearest short name or protocol to one that is no run either."""
+    return nearest(text.partition(":")[0], [*known_players(), *PROTOCOLS, *runs])

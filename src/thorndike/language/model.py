@@ -1,0 +1,58 @@
+"""A language model: its config, its parameters and its tokenizer, read from and written to a Hugging Face folder."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+from thorndike.errors import UserError
+from thorndike.language.decoder import Params
+from thorndike.language.json_fields import Dtype
+from thorndike.language.lora import load_adapter, merged
+from thorndike.language.model_config import ModelConfig, as_json, read_model_config, with_dtype, write_model_config
+from thorndike.language.tokenizer import Tokenizer, load_tokenizer, save_tokenizer
+from thorndike.language.weights import SHARD, load_params, save_params
+from thorndike.training.json_files import as_bytes
+
+
+class LanguageModel(NamedTuple):
+    """A model that reads and writes text."""
+
+    config: ModelConfig
+    params: Params
+    tokenizer: Tokenizer
+
+
+def load_model(folder: str | Path, *, dtype: Dtype | None = None, adapter: str | Path | None = None) -> LanguageModel:
+    """The model in a Hugging Face folder, in another precision if ``dtype`` says so, with a LoRA ``adapter`` merged into it if given.
+
+    Raises ``UserError`` where there is no model, or one whose logits would not be those of transformers.
+    """
+    config, params = load_decoder(folder, dtype=dtype)
+    if adapter is not None:
+        params = merged(params, config, load_adapter(Path(adapter), config))
+    return LanguageModel(config, params, load_tokenizer(Path(folder)))
+
+
+def load_decoder(folder: str | Path, *, dtype: Dtype | None = None) -> tuple[ModelConfig, Params]:
+    """The same without a tokenizer."""
+    path = Path(folder)
+    if not path.is_dir():
+        raise UserError(f"{folder} is no folder; give one as transformers' save_pretrained writes it")
+    config = read_model_config(path)
+    config = config if dtype is None else with_dtype(config, dtype)
+    return config, load_params(path, config)
+
+
+def save_model(model: LanguageModel, folder: str | Path, shard_bytes: int = SHARD) -> None:
+    """Write a folder that transformers and vLLM load. Raises ``UserError`` if there is something in it already."""
+    path = Path(folder)
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        raise UserError(f"{folder} is there already: a model is never written over; choose another folder")
+    path.mkdir(parents=True, exist_ok=True)
+    config = model.config
+    write_model_config(config, path)
+    if not config.num_labels:
+        content = as_json(config)
+        tokens = {name: content[name] for name in ("bos_token_id", "eos_token_id", "pad_token_id") if content[name] is not None}
+        (path / "generation_config.json").write_bytes(as_bytes(tokens))
+    save_params(model.params, config, path, shard_bytes)
+    save_tokenizer(model.tokenizer, path)
