@@ -2,7 +2,7 @@
 // until the server has said that it is on the disk; until then it is sent again, under the same name, so that it counts once.
 "use strict";
 
-const AHEAD = 5;
+const AHEAD = 8;
 const RETRY_MS = [200, 500, 1000, 2000, 4000];
 const RATE_WINDOW_MS = 5 * 60 * 1000;
 const $ = (id) => document.getElementById(id);
@@ -25,6 +25,7 @@ let outbox = [];           // what the server has not acknowledged yet, in order
 let sending = false;
 let fetching = null;
 let exhausted = false;
+let offline = false;
 let counts = { own: 0, done: 0, items_in_all: 0 };
 let times = [];            // of this session's judgements
 const finished = new Set();  // assignments that were judged here: the server may not know yet
@@ -59,7 +60,8 @@ async function send() {
     try {
       answer = await post(entry.path, entry.body);
     } catch {
-      showSaved(true);
+      offline = true;
+      showSaved();
       await new Promise((resolve) => setTimeout(resolve, RETRY_MS[Math.min(failures, RETRY_MS.length - 1)]));
       failures += 1;
       continue;
@@ -72,7 +74,7 @@ async function send() {
     showSaved();
   }
   sending = false;
-  if (queue.length < AHEAD - 1) more();
+  if (queue.length < AHEAD - 2) more();
 }
 
 async function post(path, body) {
@@ -82,6 +84,7 @@ async function post(path, body) {
     return { error: said.error || "the server did not understand this page: reload it" };
   }
   if (!response.ok) throw new Error(`status ${response.status}`);
+  offline = false;
   return response.json();
 }
 
@@ -102,7 +105,8 @@ async function fetchMore() {
     try {
       answer = await post("next", { rater, count });
     } catch {
-      showSaved(true);
+      offline = true;
+      showSaved();
       await new Promise((resolve) => setTimeout(resolve, RETRY_MS[Math.min(failures, RETRY_MS.length - 1)]));
       continue;
     }
@@ -112,6 +116,7 @@ async function fetchMore() {
     queue.push(...fresh);
     fresh.forEach(prefetchClips);
     exhausted = answer.items.length < count && !outbox.length;
+    showSaved();
     counts = { own: answer.own + outbox.filter((entry) => entry.path === "judge").length, done: answer.done, items_in_all: answer.items_in_all };
     showCounts();
     draw();
@@ -143,7 +148,7 @@ function judge(verdict, ranks = null) {
   showCounts();
   speak(verdict, ranks);
   draw();
-  if (queue.length < AHEAD - 1 && !exhausted) more();
+  if (queue.length < AHEAD - 2 && !exhausted) more();
 }
 
 function undo() {
@@ -330,7 +335,7 @@ function speak(verdict, ranks) {
   $("spoken").textContent = `${words[verdict]}. Next item.`;
 }
 
-function showSaved(offline = false) {
+function showSaved() {
   const waiting = outbox.length;
   $("saved").classList.toggle("waiting", offline);
   $("saved").textContent = offline
