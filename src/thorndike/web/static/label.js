@@ -248,9 +248,10 @@ function parts(content, place = 0) {
 function marked(box, text) {
   box.dataset.text = text;
   if (!showsSpaces()) { box.textContent = text; return box; }
-  box.replaceChildren(...text.split(/( |\t|\n)/).filter((part) => part !== "").map((part) => {
+  box.replaceChildren(...text.split(/( |\t|\n)/).filter((part) => part !== "").flatMap((part) => {
     const sign = { " ": "·", "\t": "→\t", "\n": "↵\n" }[part];
-    return sign ? element("span", "mark", sign) : document.createTextNode(part);
+    // Lines may break after a sign, as they did at the space.
+    return sign ? [element("span", "mark", sign), document.createElement("wbr")] : [document.createTextNode(part)];
   }));
   return box;
 }
