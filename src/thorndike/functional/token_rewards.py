@@ -58,8 +58,8 @@ def whitened(x: Float[Array, "*B"], weight: Float[Array, "*B"], shift_mean: bool
 def group_advantages(reward: Float[Array, "P G"], scale: GroupScale = "group") -> Float[Array, "P G"]:
     """Rewards minus the mean of their prompt's samples; ``group`` divides by their deviation too.
 
-    Shao et al. 2024 (arXiv:2402.03300), section 4.1.2; ``none`` is Dr. GRPO (Liu et al. 2025, arXiv:2503.20783): the division weighs prompts
-    that are nearly always or never solved more.
+    Shao et al. 2024 (arXiv:2402.03300), section 4.1.2; ``none`` is Dr. GRPO (Liu et al. 2025, arXiv:2503.20783): the division weighs
+    prompts that are nearly always or never solved more.
     """
     centred = reward - jnp.mean(reward, axis=1, keepdims=True)
     return centred if scale == "none" else centred / (jnp.std(reward, axis=1, keepdims=True, ddof=1) + 1e-4)
