@@ -10,7 +10,7 @@ import pytest
 
 from language.make_reference import REFERENCE
 from thorndike.errors import UserError
-from thorndike.language.comparisons import Comparison, Pair, batch_of, on_device, preferred, ranked
+from thorndike.language.comparisons import Comparison, Pair, comparison_data, preferred, ranked
 from thorndike.language.lora import LoraConfig
 from thorndike.language.model import load_decoder
 from thorndike.language.reward_files import RewardModel, load_reward_model, normalised, refuse_if_near_chance, save_reward_model
@@ -33,7 +33,7 @@ def comparison(generator: np.random.Generator, right: bool = True) -> Comparison
 
 def data(number: int, seed: int, flips: bool = False):
     generator = np.random.default_rng(seed)
-    return batch_of([comparison(generator, not flips or generator.random() < 0.5) for _ in range(number)], 0, 12)
+    return comparison_data([comparison(generator, not flips or generator.random() < 0.5) for _ in range(number)], 0, 12)
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +89,7 @@ def _language_model(tmp_path: Path) -> Path:
 
 def test_the_loss_is_that_of_a_loop_over_pairs():
     generator = np.random.default_rng(4)
-    batch = batch_of(
+    batch = comparison_data(
         [
             ranked([5], [[6], [7], [8]]),
             Comparison(((5, 6), (5, 7)), 1, (Pair(1, 0, 0.8, 0.5),)),
@@ -107,14 +107,15 @@ def test_the_loss_is_that_of_a_loop_over_pairs():
         total += weight * (fit_loss + 0.01 * (a + b) ** 2)
         weights += weight
         right += weight * ((a > b) == (p > 0.5)) * (p != 0.5)
-    loss, metrics = comparison_loss(jnp.asarray(scores), on_device(batch), Config(label_smoothing=0.1))
+    loss, metrics = comparison_loss(jnp.asarray(scores), batch.rows(np.arange(3)), Config(label_smoothing=0.1))
     np.testing.assert_allclose(loss, total / weights, rtol=1e-5)
     np.testing.assert_allclose(metrics["train/accuracy"], right / (weights - 1.0), rtol=1e-5)
 
 
 @pytest.mark.parametrize("loss", ["bradley_terry", "plackett_luce"])
 def test_accumulated_parts_are_the_same_step(loss):
-    batch = on_device(batch_of([ranked([5, 6], [[7, 8], [9], [10, 11, 12]]) for _ in range(2)] + [ranked([5, 9], [[8], [9], [7]])] * 2, 0))
+    rankings = [ranked([5, 6], [[7, 8], [9], [10, 11, 12]])] * 2 + [ranked([5, 9], [[8], [9], [7]])] * 2
+    batch = comparison_data(rankings, 0).rows(np.arange(4))
     states = []
     for parts in (1, 2):
         learner = reward_model(Config(batch_size=4, gradient_accumulation=parts, loss=loss), CONFIG)
@@ -151,15 +152,15 @@ def test_calibration_and_accuracy_by_gap():
 
 def test_mistakes_in_the_data_are_told():
     with pytest.raises(UserError, match="no comparison"):
-        batch_of([], 0)
+        comparison_data([], 0)
     with pytest.raises(UserError, match="completion 2 is empty"):
-        batch_of([preferred([5], [6], [])], 0)
+        comparison_data([preferred([5], [6], [])], 0)
     with pytest.raises(UserError, match="more than max_length = 2"):
-        batch_of([preferred([5], [6, 7], [6])], 0, width=2)
+        comparison_data([preferred([5], [6, 7], [6])], 0, width=2)
     with pytest.raises(UserError, match=r"probability 1\.2"):
-        batch_of([preferred([5], [6], [7], 1.2)], 0)
+        comparison_data([preferred([5], [6], [7], 1.2)], 0)
     with pytest.raises(UserError, match="names texts 0 and 2"):
-        batch_of([Comparison(((5, 6), (5, 7)), 1, (Pair(0, 2),))], 0)
+        comparison_data([Comparison(((5, 6), (5, 7)), 1, (Pair(0, 2),))], 0)
     with pytest.raises(UserError, match="lower it"):
         fit(reward_model(Config(), CONFIG), Config(), PARAMS, data(4, 0))
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from thorndike.errors import UserError
 
@@ -35,7 +35,20 @@ class Comparison(NamedTuple):
 
 
 class ComparisonBatch(NamedTuple):
-    """Rows of comparisons, padded to one shape. Padding has segment 0, and pairs of padding weigh nothing."""
+    """Rows of comparisons on the device, padded to one shape. Padding has segment 0, and pairs of padding weigh nothing."""
+
+    tokens: Int[Array, "*R K T"]
+    segments: Int[Array, "*R K T"]
+    prompt_lengths: Int[Array, "*R"]
+    valid: Bool[Array, "*R K"]
+    first: Int[Array, "*R M"]
+    second: Int[Array, "*R M"]
+    p_first: Float[Array, "*R M"]
+    weight: Float[Array, "*R M"]
+
+
+class ComparisonData(NamedTuple):
+    """All comparisons there are, on the host; the fields are those of ``ComparisonBatch``."""
 
     tokens: Int[np.ndarray, "R K T"]
     segments: Int[np.ndarray, "R K T"]
@@ -46,9 +59,9 @@ class ComparisonBatch(NamedTuple):
     p_first: Float[np.ndarray, "R M"]
     weight: Float[np.ndarray, "R M"]
 
-    def rows(self, numbers: Sequence[int] | Int[np.ndarray, " rows"]) -> "ComparisonBatch":
-        """Some of the rows."""
-        return ComparisonBatch(*(part[np.asarray(numbers)] for part in self))
+    def rows(self, numbers: Int[np.ndarray, "*rows"]) -> ComparisonBatch:
+        """Some of the rows, on the device."""
+        return ComparisonBatch(*(jnp.asarray(part[numbers]) for part in self))
 
 
 def preferred(
@@ -67,7 +80,7 @@ def ranked(prompt: Sequence[int], completions: Sequence[Sequence[int]]) -> Compa
     return Comparison(tuple((*prompt, *each) for each in completions), len(prompt), pairs)
 
 
-def batch_of(comparisons: Sequence[Comparison], pad_id: int, width: int | None = None) -> ComparisonBatch:
+def comparison_data(comparisons: Sequence[Comparison], pad_id: int, width: int | None = None) -> ComparisonData:
     """All comparisons as arrays, as wide as the longest text unless ``width`` is given.
 
     Raises ``UserError`` for an empty text or one longer than ``width``, and for a probability or a weight that is none.
@@ -81,7 +94,7 @@ def batch_of(comparisons: Sequence[Comparison], pad_id: int, width: int | None =
     if longest > size:
         raise UserError(f"a text of a comparison has {longest} tokens, more than max_length = {size}: raise it, or shorten the texts")
     shape = (len(comparisons), texts, size)
-    batch = ComparisonBatch(
+    batch = ComparisonData(
         np.full(shape, pad_id, np.int32), np.zeros(shape, np.int32), np.array([each.prompt_length for each in comparisons], np.int32),
         np.zeros(shape[:2], bool), np.zeros((len(comparisons), pairs), np.int32), np.zeros((len(comparisons), pairs), np.int32),
         np.full((len(comparisons), pairs), 0.5, np.float32), np.zeros((len(comparisons), pairs), np.float32),
@@ -98,11 +111,6 @@ def batch_of(comparisons: Sequence[Comparison], pad_id: int, width: int | None =
             batch.first[row, place], batch.second[row, place] = pair.first, pair.second
             batch.p_first[row, place], batch.weight[row, place] = pair.p_first, pair.weight
     return batch
-
-
-def on_device(batch: ComparisonBatch) -> ComparisonBatch:
-    """The same as JAX arrays."""
-    return ComparisonBatch(*map(jnp.asarray, batch))
 
 
 def _check(pair: Pair, texts: int, row: int) -> None:

@@ -137,5 +137,5 @@ def _held_out(content: Json, where: Path) -> HeldOut:
         fields = {name: content[name] for name in HeldOut._fields}
         low, high = cast(list[float], fields["accuracy_ci95"])
         fields |= {"accuracy_ci95": (float(low), float(high))}
-        fields["by_gap"] = tuple(GapAccuracy(**each) for each in cast(list[dict[str, float]], content["by_gap"]))
+        fields["by_gap"] = tuple(GapAccuracy(**each) for each in cast(list[dict], content["by_gap"]))
         return HeldOut(**cast(dict, fields))

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from thorndike.errors import UserError
-from thorndike.language.comparisons import ComparisonBatch, on_device
+from thorndike.language.comparisons import ComparisonBatch, ComparisonData
 from thorndike.language.decoder import Params
 from thorndike.language.learner import Learner, State
 from thorndike.language.model_config import ModelConfig
@@ -44,7 +44,7 @@ def ensemble(learner: Learner, params: Params, members: int, seed: int) -> Ensem
 
 
 def fit(
-    learner: Learner, config: Config, params: Params, data: ComparisonBatch, *, members: int = 1, seed: int = 0, log: Log | None = None
+    learner: Learner, config: Config, params: Params, data: ComparisonData, *, members: int = 1, seed: int = 0, log: Log | None = None
 ) -> list[Params]:
     """The parameters of each member after ``config.total_steps`` steps, in passes over the data, each member's in an order of its own.
 
@@ -58,8 +58,7 @@ def fit(
     orders = [_order(np.random.default_rng([seed, member]), rows, config) for member in range(members)]
     for step in range(config.total_steps):
         chosen = np.stack([order[step] for order in orders])
-        batch = on_device(ComparisonBatch(*(part[chosen] for part in data)))
-        states, metrics = fitted.update(states, frozen, batch)
+        states, metrics = fitted.update(states, frozen, data.rows(chosen))
         if log is not None:
             log(step + 1, {name: np.asarray(value).tolist() for name, value in metrics.items()})
     return [learner.params(_member(states, number), params) for number in range(members)]
@@ -71,7 +70,7 @@ def steps_of_an_epoch(rows: int, batch_size: int, epochs: int = 1) -> int:
 
 
 def scores_of(
-    members: list[Params], config: ModelConfig, data: ComparisonBatch, pool: str, batch_size: int = 64
+    members: list[Params], config: ModelConfig, data: ComparisonData, pool: str, batch_size: int = 64
 ) -> Float[np.ndarray, "E R K"]:
     """The rewards of all texts by each member."""
     rows = len(data.valid)
@@ -79,12 +78,12 @@ def scores_of(
     found = []
     for start in range(0, rows, batch_size):
         numbers = np.minimum(np.arange(start, start + batch_size), rows - 1)
-        batch = on_device(data.rows(numbers))
+        batch = data.rows(numbers)
         found.append(np.stack([np.asarray(score(params, batch)) for params in members]))
     return np.concatenate(found, axis=1)[:, :rows]
 
 
-def report_on(scores: Float[np.ndarray, "R K"], data: ComparisonBatch) -> HeldOut:
+def report_on(scores: Float[np.ndarray, "R K"], data: ComparisonData) -> HeldOut:
     """Held-out accuracy of rewards; the evidence is that of so many comparisons, not of so many pairs."""
     counts = data.weight > 0
     first, second = (np.take_along_axis(scores, index, axis=1)[counts] for index in (data.first, data.second))
@@ -92,7 +91,7 @@ def report_on(scores: Float[np.ndarray, "R K"], data: ComparisonBatch) -> HeldOu
     return held_out_report(first, second, data.p_first[counts], independent=_independent(data, sure))
 
 
-def _independent(data: ComparisonBatch, sure: np.ndarray) -> int:
+def _independent(data: ComparisonData, sure: np.ndarray) -> int:
     """K texts that are compared with each other tell at most K - 1 independent pairs."""
     return int(np.minimum(sure.sum(axis=1), np.maximum(data.valid.sum(axis=1) - 1, 1))[sure.any(axis=1)].sum()) or 1
 
