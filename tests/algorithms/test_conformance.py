@@ -13,6 +13,7 @@ from made_up_data import BOX, DISCRETE, made_up
 from thorndike.algorithms import (
     a2c,
     a3c,
+    alphazero,
     awac,
     bc,
     bootstrapped_dqn,
@@ -39,6 +40,8 @@ from thorndike.algorithms import (
 from thorndike.environments import novelty, wrappers
 from thorndike.environments.native import factory
 from thorndike.environments.native.vectorize import vectorize
+from thorndike.games.environment import game_environment
+from thorndike.games.registry import game
 from thorndike.networks.torso import example_observation
 from thorndike.training import segment as segment_module
 from thorndike.training.checkpoints import Progressed, restore, save_checkpoint
@@ -95,6 +98,19 @@ class DataCase(NamedTuple):
         return algorithm, dataset_source(data, algorithm)
 
 
+class GameCase(NamedTuple):
+    """A learner that plays a game with itself."""
+
+    build: object
+    config: object
+    game: str
+
+    def make(self) -> tuple[Algorithm, Source]:
+        environment = game_environment(game(self.game), NUM_ENVS)
+        algorithm = self.build(self.config, environment.spec)
+        return algorithm, compiled_source(environment, algorithm, wrappers.chain())
+
+
 DATA = {"total_steps": 1000, "batch_size": 8, "net_arch": (8,)}
 
 
@@ -102,6 +118,20 @@ def parts(config, **changes):
     return dataclasses.replace(config, **changes)
 
 
+ALPHAZERO = alphazero.Config(
+    total_steps=1000,
+    n_steps=2,
+    batch_size=16,
+    gradient_steps=2,
+    buffer_size=100,
+    learning_starts=16,
+    num_simulations=4,
+    fast_simulations=2,
+    full_search_fraction=0.5,
+    width=8,
+    blocks=1,
+    learning_rate="linear(1e-3, 0)",
+)
 TRPO = trpo.Config(total_steps=1000, n_steps=8, batch_size=16, n_critic_updates=2, net_arch=(8,), cg_max_steps=4)
 BINS = (wrappers.discretise(6),)
 RUN = {
@@ -124,6 +154,7 @@ RUN = {
     "bootstrapped_dqn": Case(bootstrapped_dqn.bootstrapped_dqn, bootstrapped_dqn.Config(**OF_THE_FAMILY, n_members=3), "CartPole-v1"),
     "ppo, bonuses": Case(ppo.ppo, PPO, "CartPole-v1", NEW),
     "q_learning": Case(q_learning.q_learning, parts(TABLE, variant="sarsa"), "MountainCar-v0", BINS),
+    "alphazero": GameCase(alphazero.alphazero, parts(ALPHAZERO, resign_threshold=-0.1), "tic_tac_toe"),
     "iql": DataCase(iql.iql, iql.Config(**DATA, learning_rate="linear(1e-3, 0)"), DISCRETE),
     "td3_bc": DataCase(td3_bc.td3_bc, td3_bc.Config(**DATA), BOX),
     "cql, Box": DataCase(cql.cql, cql.Config(**DATA, n_actions=2), BOX),
@@ -134,6 +165,8 @@ ALL = RUN | {
     "sac, held noise": Case(sac.sac, sac.Config(**CONTROL, use_sde=True), "Pendulum-v1"),
     "ppo, Box, held noise, gru": Case(ppo.ppo, parts(PPO, use_sde=True, memory="gru", memory_size=8), "Pendulum-v1"),
     "ppo, Box, beta": Case(ppo.ppo, parts(PPO, action_distribution="beta"), "Pendulum-v1"),
+    "alphazero, puct": GameCase(alphazero.alphazero, parts(ALPHAZERO, search="puct", tower="patches"), "connect_four"),
+    "alphazero, conv": GameCase(alphazero.alphazero, parts(ALPHAZERO, tower="conv", full_search_fraction=1.0), "connect_four"),
     "bc": DataCase(bc.bc, bc.Config(**DATA), DISCRETE),
     "bc, Box": DataCase(bc.bc, bc.Config(**DATA), BOX),
     "iql, Box": DataCase(iql.iql, iql.Config(**DATA), BOX),

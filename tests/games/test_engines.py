@@ -248,3 +248,33 @@ def test_real_chess_engines_play_legal_games_against_random_moves(name, id, quic
         position = rules.play(position, moves[-1])
     assert len(moves) > 5
     player.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "id"), installed([("fairy", id) for id in ENGINES["fairy"].games]))
+def test_legal_moves_are_those_of_fairy_stockfish(name, id, quick_compile):
+    rules, random = Compiled(game(id)), np.random.default_rng(2)
+    protocol = "usi" if "shogi" in id else "uci"
+    variant = {"gardner_chess": "gardner", "animal_shogi": "dobutsu"}.get(id, id)
+    process = EngineProcess((program_of(ENGINES[name]),))
+    process.send(protocol)
+    process.send(f"setoption name UCI_Variant value {variant}")
+    for _ in range(3):
+        position, names = rules.init(jax.random.key(0)), []
+        for _ in range(60):
+            legal, _, over, _ = rules.facts(position)
+            if over:
+                break
+            process.send("position startpos" + (" moves " if names else "") + " ".join(names))
+            process.send("go perft 1")
+            listed = []
+            while not (line := process.line(time.monotonic() + 20)).startswith("Nodes searched"):
+                listed += [line.split(":")[0]] if line.endswith(": 1") else []
+            # A chick need not become a hen there.
+            listed = [move for move in listed if id != "animal_shogi" or f"{move}+" not in listed]
+            assert sorted(rules.game.action_name(position, move) for move in legal) == sorted(listed), names
+            action = int(random.choice(legal))
+            names.append(rules.game.action_name(position, action))
+            position = rules.play(position, action)
+        assert len(names) > 5
+    process.close()

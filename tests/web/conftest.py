@@ -25,6 +25,7 @@ class Served(NamedTuple):
 
 @pytest.fixture(scope="module")
 def studio() -> Iterator[Served]:
+    pytest.importorskip("nicegui")
     process = subprocess.Popen(
         [sys.executable, str(Path(__file__).with_name("served_studio.py")), TOKEN], stdout=subprocess.PIPE, text=True
     )

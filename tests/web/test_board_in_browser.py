@@ -251,6 +251,21 @@ def test_an_opponent_that_breaks_is_told_and_another_sits_down(page, studio):
     expect(moves(page)).to_have_text(["a3", "b3"])
 
 
+def test_what_is_being_chosen_survives_a_move_and_follows_swapped_sides(page, studio):
+    start(page, studio, opponent="first")
+    page.get_by_text("Change the opponent").click()
+    page.get_by_label("Strength").scroll_into_view_if_needed()
+    page.get_by_label("Opponent").select_option("lookahead")
+    expect(page.get_by_label("Strength")).to_be_enabled()
+    square(page, 1, 1).click()
+    expect(moves(page)).to_have_count(2)
+    expect(page.get_by_label("Opponent")).to_have_value("lookahead")
+    page.get_by_role("button", name="Swap sides").click()
+    expect(moves(page)).to_have_count(3)
+    expect(page.get_by_label("Who begins")).to_have_value("opponent")
+    expect(page.get_by_label("Opponent")).to_have_value("first")
+
+
 def test_a_small_screen_needs_no_scrolling_sideways(page, studio):
     page.set_viewport_size({"width": 360, "height": 700})
     start(page, studio, "connect_four", opponent="lookahead")

@@ -156,7 +156,6 @@ SOCKET_PATH = "/_nicegui_ws/socket.io/?EIO=4&transport=websocket"
 
 
 def test_the_studio_refuses_strangers_everywhere(studio):
-    pytest.importorskip("nicegui")
     cookie = {"cookie": f"thorndike_{studio.port}=a-token-of-the-tests"}
     assert answer(studio, "GET", "/", **cookie)[0] == 200
     for path in ("/", "/new/connect_four", "/studio/studio.css", "/_nicegui_ws/socket.io/?EIO=4&transport=polling", "/nothing", "/docs"):

@@ -20,6 +20,7 @@ OPTIONAL = {
     "imageio": "video",
     "imageio-ffmpeg": "video",
     "pygame-ce": "video",
+    "nicegui": "web",
 }
 """Package -> the extra that brings it."""
 

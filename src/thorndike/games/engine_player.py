@@ -66,6 +66,9 @@ def engine_player(name: str, start: Start) -> Player:
             return Choice(int(legal[0]), resigns=True, remark=f"{name} resigns")
         action = named_action(turn.game, turn.position, told.move)
         if action is None:
+            # Fairy-Stockfish may leave a chick of animal shogi as it is on the last rank, where by these rules it becomes a hen.
+            action = named_action(turn.game, turn.position, f"{told.move}+")
+        if action is None:
             return Choice(int(legal[0]), resigns=True, remark=f"{name} forfeits: {told.move[:40]!r} is no legal move here")
         return Choice(action, told.win_probability)
 

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from thorndike.errors import UserError
@@ -16,6 +15,8 @@ from thorndike.games.match_file import MatchFile, PlayedGame
 from thorndike.games.tally import Tally, tally
 
 Progress: TypeAlias = Callable[[PlayedGame], None]
+
+_DRAWN_OPENINGS = 200
 
 
 class Match(NamedTuple):
@@ -38,23 +39,34 @@ class Compiled(NamedTuple):
     """Position, action, seed, number of the move."""
     legal: Callable[[Position], np.ndarray]
     """Actions, none when the game is over."""
+    mover: Callable[[Position], int]
+    """0 or 1."""
+    rewards: Callable[[Position], tuple[float, float]]
 
 
 def compiled(game: Game) -> Compiled:
     """Compiled when they are first called."""
 
-    def step(position: Position, action: int, seed: int, number: int) -> Position:
-        return jax.jit(game.step)(position, jnp.int32(action), jax.random.fold_in(jax.random.key(seed), number))
+    init, player, rewards = jax.jit(game.init), jax.jit(game.player), jax.jit(game.rewards)
+    look = jax.jit(lambda position: game.legal(position) & ~game.terminated(position))
+    move = jax.jit(lambda position, action, seed, number: game.step(position, action, jax.random.fold_in(jax.random.key(seed), number)))
 
-    def legal(position: Position) -> np.ndarray:
-        over, mask = jax.device_get((jax.jit(game.terminated)(position), jax.jit(game.legal)(position)))
-        return np.flatnonzero(mask) if not over else np.zeros(0, int)
+    def both(position: Position) -> tuple[float, float]:
+        first, second = np.asarray(rewards(position)).tolist()
+        return first, second
 
-    return Compiled(game, lambda seed: jax.jit(game.init)(jax.random.key(seed)), step, legal)
+    return Compiled(
+        game,
+        init=lambda seed: init(jax.random.key(seed)),
+        step=lambda position, action, seed, number: move(position, np.int32(action), np.uint32(seed % 2**32), np.int32(number)),
+        legal=lambda position: np.flatnonzero(look(position)),
+        mover=lambda position: int(player(position)),
+        rewards=both,
+    )
 
 
 def openings(rules: Compiled, plies: int, seed: int) -> list[tuple[int, ...]]:
-    """All beginnings of so many moves that do not end the game, in an order drawn from ``seed``; beyond 2 moves a thousand drawn ones.
+    """All beginnings of so many moves that do not end the game, in an order drawn from ``seed``; beyond 2 moves some drawn ones.
 
     A game with dice begins differently anyway: there it is the beginning alone.
     """
@@ -65,7 +77,7 @@ def openings(rules: Compiled, plies: int, seed: int) -> list[tuple[int, ...]]:
         found = _all_openings(rules, rules.init(0), plies)
         random.shuffle(found)
     else:
-        drawn = (_random_opening(rules, plies, random) for _ in range(1000))
+        drawn = (_random_opening(rules, plies, random) for _ in range(_DRAWN_OPENINGS))
         found = list(dict.fromkeys(opening for opening in drawn if opening is not None))
     if not found:
         raise UserError(f"no game of {rules.game.id} lasts {plies} moves: give fewer opening moves")
@@ -122,7 +134,7 @@ def play_game(rules: Compiled, players: tuple[Player, Player], number: int, open
     movers: list[int] = []
     remark, rewards = "", None
     while len(legal := rules.legal(position)):
-        mover = int(jax.jit(game.player)(position))
+        mover = rules.mover(position)
         if len(moves) < len(opening):
             action = int(opening[len(moves)])
         else:
@@ -138,7 +150,7 @@ def play_game(rules: Compiled, players: tuple[Player, Player], number: int, open
         movers.append(mover)
         position = rules.step(position, action, seed, len(moves))
         moves.append(action)
-    first, second = rewards or np.asarray(jax.jit(game.rewards)(position)).tolist()
+    first, second = rewards or rules.rewards(position)
     score = 0.5 if first == second else float(first > second)
     return PlayedGame(number, (players[0].name, players[1].name), len(opening), tuple(zip(movers, names, strict=True)), score, remark)
 

@@ -113,7 +113,9 @@ def _line(tree: mctx.Tree, action: Int[Array, ""]) -> Int[Array, " length"]:
         node, move = carry
         child = jnp.where(move >= 0, tree.children_index[node, move], -1)
         visits = tree.children_visits[child]
-        reply = jnp.where((child >= 0) & jnp.any(visits > 0), jnp.argmax(visits), -1).astype(jnp.int32)
+        # Where a game is over the tree grows on, with a discount of 0.
+        goes_on = (child >= 0) & (tree.children_discounts[node, move] != 0) & jnp.any(visits > 0)
+        reply = jnp.where(goes_on, jnp.argmax(visits), -1).astype(jnp.int32)
         return (jnp.maximum(child, 0), reply), move
 
     return jax.lax.scan(follow, (jnp.int32(tree.ROOT_INDEX), action), None, length=LONGEST_LINE)[1]

@@ -34,7 +34,8 @@ class Sampling:
         check(self)
 
 
-GREEDY = Sampling(temperature=0.0)
+AS_TRAINED, GREEDY = Sampling(), Sampling(temperature=0.0)
+"""From the model's own distribution, and its likeliest token."""
 
 
 class Generated(NamedTuple):

@@ -85,7 +85,7 @@ def descend(
     optimizer: optax.GradientTransformation, rate: Float[Array, ""], state: State, gradient: PyTree
 ) -> tuple[State, Float[Array, ""]]:
     """The state after a step, and the norm of the gradient before it was clipped."""
-    norm = optax.global_norm(gradient)
+    norm = optax.tree.norm(gradient)
     direction, opt_state = optimizer.update(gradient, state.opt_state, state.trained)
     trained = jax.tree.map(lambda leaf, change: leaf - rate * change, state.trained, direction)
     return State(trained, opt_state, state.step + 1), norm

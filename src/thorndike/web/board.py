@@ -48,7 +48,7 @@ class _BoardPage:
         self._alone = True if self._table.game.num_players == 1 else None
         self._moves: list[tuple[Tag, Tag]] = []
         self._names: tuple[str, ...] = ()
-        self._asked = False
+        self._asked, self._newest = False, 0
         with Tag("div", "play"):
             with Tag("section", "board-side", "", {"aria-label": "Board"}):
                 self._add_board_side()
@@ -134,9 +134,10 @@ class _BoardPage:
     async def refresh(self) -> None:
         """Draw the table as it is now."""
         self._asked = False
+        self._newest = number = self._newest + 1
         moment = await run.io_bound(self._look_at)
         # None when the studio ends; and a newer one may have overtaken this.
-        if moment is not None and not self._asked:
+        if moment is not None and number == self._newest:
             self._draw(*moment)
 
     def _look_at(self) -> tuple[View, Picture]:

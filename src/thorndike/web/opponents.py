@@ -48,26 +48,26 @@ def opponents_in(output: Path) -> Opponents:
         if game_id in ONE_PLAYER:
             return ()
         searched = game_id not in _WITHOUT_SEARCH
-        found = [_named(str(run), _run_name(run), searched) for run in reversed(all_runs(output)) if _trained_on(run, game_id)]
+        found = [
+            _named(str(run), f"{run.parent.name}, {run.name}", searched, "Trained: ")
+            for run in reversed(all_runs(output))
+            if _trained_on(run, game_id)
+        ]
         if searched and game_id not in _LONG:
-            found.append(_named("mcts", "Tree search, by games played out at random", searches=True))
+            found.append(_named("mcts", "Tree search, without a network", searches=True))
         found += [_named(name, _ENGINE_NAMES.get(name, name)) for name in ENGINES if _plays(name, game_id)]
         return [*found, _named("random", "Random moves")]
 
     return opponents
 
 
-def _named(who: str, name: str, searches: bool = False) -> Opponent:
+def _named(who: str, name: str, searches: bool = False, kind: str = "") -> Opponent:
     def make(game: Game, simulations: int) -> Player:
         from thorndike.api.playing import player
 
         return player(who, game, simulations=simulations)._replace(name=name)
 
-    return Opponent(who, name, make, searches)
-
-
-def _run_name(run: Path) -> str:
-    return f"Trained: {run.parent.name}, {run.name}"
+    return Opponent(who, kind + name, make, searches)
 
 
 def _trained_on(run: Path, game_id: str) -> bool:

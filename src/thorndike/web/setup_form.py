@@ -10,12 +10,14 @@ class SetupForm:
     """Three choices, with what is chosen in ``setup``."""
 
     def __init__(self, studio: Studio, setup: Setup) -> None:
-        self.setup = setup
+        self.setup = self._seen = setup
         self._offered = {opponent.id: opponent for opponent in studio.opponents(setup.game)}
         sides = look_of(setup.game).sides
         with Tag("div", "fields") as fields:
             fields.set_attribute("hidden", True if setup.game in ONE_PLAYER else None)
-            select("Opponent", {each.id: each.name for each in self._offered.values()}, setup.opponent, self._choose_opponent)
+            self._opponent = select(
+                "Opponent", {each.id: each.name for each in self._offered.values()}, setup.opponent, self._choose_opponent
+            )
             strengths = {str(number): f"{number:,} simulations a move" for number in STRENGTHS}
             self._strength = select("Strength", strengths, str(setup.simulations), self._choose_strength)
             begins = {"person": f"I do, with {sides[0]}", "opponent": f"The opponent; I play {sides[1]}"}
@@ -23,9 +25,9 @@ class SetupForm:
         self._update()
 
     def show(self, setup: Setup) -> None:
-        """Another setup, chosen elsewhere."""
-        if setup != self.setup:
-            self.setup = setup
+        """The setup that holds: where it has changed it replaces what was chosen here and not yet used."""
+        if setup != self._seen:
+            self.setup = self._seen = setup
             self._update()
 
     async def _choose_opponent(self, value: str) -> None:
@@ -36,11 +38,16 @@ class SetupForm:
     async def _choose_strength(self, value: str) -> None:
         if value.isdecimal() and int(value) in STRENGTHS:
             self.setup = self.setup._replace(simulations=int(value))
+            self._update()
 
     async def _choose_beginner(self, value: str) -> None:
         self.setup = self.setup._replace(person_begins=value != "opponent")
+        self._update()
 
     def _update(self) -> None:
         chosen = self._offered[self.setup.opponent]
+        self._opponent.set_attribute("value", chosen.id)
+        self._strength.set_attribute("value", str(self.setup.simulations))
+        self._begins.set_attribute("value", "person" if self.setup.person_begins else "opponent")
         self._strength.set_attribute("disabled", None if chosen.searches else True)
         self._begins.set_attribute("disabled", None if chosen.make is not None else True)

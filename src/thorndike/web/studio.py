@@ -73,16 +73,16 @@ class Studio:
 
     def change(self, name: str, setup: Setup) -> None:
         """Seat others at a table; the moves stay."""
-        with self._lock:
-            place = self._places[name]
-            self._places[name] = place._replace(setup=setup)
         seats, analyst = self._seats(setup)
+        with self._lock:
+            place = self._known(name)
+            self._places[name] = place._replace(setup=setup)
         place.table.seat(seats, analyst)
 
     def swap_sides(self, name: str) -> None:
         """Everybody at a table takes the next seat; the moves stay."""
         with self._lock:
-            place = self._places[name]
+            place = self._known(name)
             place.table.swap_sides()
             self._places[name] = place._replace(setup=place.setup._replace(person_begins=not place.setup.person_begins))
 
@@ -103,6 +103,11 @@ class Studio:
         ends = time.monotonic() + _PATIENCE_S
         for thread in [thread for place in self.places().values() for thread in place.table.close()]:
             thread.join(max(0.0, ends - time.monotonic()))
+
+    def _known(self, name: str) -> Place:
+        if name not in self._places:
+            raise UserError("this game is no longer on the table")
+        return self._places[name]
 
     def _keep(self, place: Place) -> str:
         name = secrets.token_urlsafe(9)
