@@ -1,5 +1,7 @@
 """Who is offered for which game, and that they play."""
 
+from pathlib import Path
+
 import jax
 import pytest
 
@@ -7,6 +9,7 @@ from made_up_runs import write_run
 from thorndike.errors import UserError
 from thorndike.games.game import Turn
 from thorndike.games.registry import game
+from thorndike.games.saved_game import saved_game_file
 from thorndike.web import opponents as module
 from thorndike.web.opponents import PERSON, opponents_in
 from thorndike.web.studio import MOST_TABLES, Setup, Studio
@@ -91,3 +94,14 @@ def test_a_saved_game_of_another_studio_is_refused(rooms):
     text = b'{"format": "thorndike-game", "version": 1, "game": "chess", "seed": 0, "players": [], "moves": [], "win_probabilities": []}'
     with pytest.raises(UserError, match="holds a game of chess, which this studio does not have"):
         rooms.open_saved(text, "the file")
+
+
+def test_a_game_of_ones_own_is_played_and_saved_and_opened(tmp_path):
+    name = f"{Path(__file__).parents[2] / 'examples/own_game.py'}:NIM"
+    offered = opponents_in(tmp_path)
+    assert [each.id for each in offered(name)] == ["mcts", "random"]
+    rooms = Studio((name,), offered)
+    place = rooms.place(rooms.open(Setup(name)))
+    view = place.table.view()
+    data = saved_game_file(place.table.game, 0, ["A", "B"], view.names, view.choices)
+    assert rooms.place(rooms.open_saved(data, "the file")).setup.game == name

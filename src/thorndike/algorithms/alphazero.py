@@ -64,8 +64,8 @@ class Config:
     full_search_fraction: Annotated[float, Between(0, 1)] = 1.0  # p: share of full searches (KataGo's playout cap randomisation)
     eval_simulations: Annotated[int, AtLeast(0)] = 64  # when playing for strength; 0: the network alone
     considered_moves: Annotated[int, AtLeast(1)] = 16  # m of gumbel: moves tried at the root
-    value_scale: Annotated[float, MoreThan(0)] = 0.1  # c_scale of gumbel: weight of values against the prior
-    rescale_values: bool = True  # gumbel: stretch the values of a node's moves to [0, 1] first
+    value_scale: Annotated[float, MoreThan(0)] = 0.5  # c_scale of gumbel: weight of values in [-1, 1] against the prior
+    rescale_values: bool = False  # gumbel: stretch the values of a node's moves to [0, 1] first
     c_puct: Annotated[float, MoreThan(0)] = 1.25  # c_init of puct: weight of the prior
     dirichlet_alpha: Annotated[float, MoreThan(0)] = 1.0  # alpha of puct's noise at the root
     dirichlet_fraction: Annotated[float, Between(0, 1)] = 0.25  # epsilon: its share of the prior there
@@ -77,7 +77,7 @@ class Config:
     vf_coef: Annotated[float, AtLeast(0)] = 1.0  # weight of the value loss
     weight_decay: Annotated[float, AtLeast(0)] = 1e-4  # c: of AdamW, decoupled
     max_grad_norm: Annotated[float, MoreThan(0)] = 1.0  # global norm the gradient is clipped to
-    averaging: Annotated[float, MoreThan(0)] = 0.005  # share of the latest parameters in the running average, a gradient step; 1: none
+    averaging: Annotated[float, MoreThan(0), Between(0, 1)] = 0.005  # how far what plays moves to the newest parameters at a step
     tower: Annotated[str, OneOf(*TOWERS)] = "mlp"  # dense layers, dense layers on shared patches, or convolutions
     width: Annotated[int, AtLeast(1)] = 256  # units of a dense layer, or channels
     blocks: Annotated[int, AtLeast(0)] = 2  # residual blocks of two layers
@@ -197,7 +197,7 @@ def alphazero(config: Config, spec: EnvSpec) -> Algorithm:
         (_, metrics), grads = jax.value_and_grad(alphazero_loss, has_aux=True)(state.params, batch, network, config.vf_coef)
         rate = learning_rate(state.env_steps / config.total_steps)
         direction, opt_state = optimizer.update(grads, state.opt_state, state.params)
-        metrics |= {"train/grad_norm": optax.global_norm(grads), "train/learning_rate": rate}
+        metrics |= {"train/grad_norm": optax.tree.norm(grads), "train/learning_rate": rate}
         metrics["train/known_outcomes"] = jnp.mean(batch.value_weight)
         metrics["train/resign_checks"], metrics["train/resign_errors"] = false_resignations(sampled)
         params = jax.tree.map(lambda p, d: p - rate * d, state.params, direction)

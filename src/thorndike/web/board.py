@@ -71,6 +71,8 @@ class _BoardPage:
         with Tag("div", "actions", "", {"role": "group", "aria-label": "Game"}):
             self._stop = button("Stop thinking", self._doing(lambda: self._table.interrupt()), "primary")
             self._go_on = button("Let it play", self._doing(lambda: self._table.go_on()), "primary")
+            self._from_here = button("Play on from here", self._doing(lambda: self._table.play_on_from_here()), "primary", asks=True)
+            self._from_here.set_attribute("data-asks", "Play on from here? The moves after this one are lost.")
             self._take_back = button("Take back", self._doing(lambda: self._table.take_back()))
             swap = button("Swap sides", self._doing(lambda: self._studio.swap_sides(self._name)))
             swap.set_attribute("hidden", self._alone)
