@@ -20,10 +20,10 @@ from thorndike.language.lora import LoraConfig
 from thorndike.language.model import LanguageModel, load_decoder
 from thorndike.language.over_optimisation import Limits, Signals, Watch, repetition, trouble, watched
 from thorndike.language.policy_descent import check_ratio
-from thorndike.language.policy_files import new_run
 from thorndike.language.policy_training import Task, train_policy
 from thorndike.language.rewards import checked_scores, weighted_sum
 from thorndike.language.rollouts import Prompts, as_written, choose_prompts, distance, distance_metrics, sample_rollout
+from thorndike.language.text_run import open_run
 from thorndike.language.tokenizer import load_tokenizer
 
 pytestmark = pytest.mark.usefixtures("quick_compile")
@@ -157,7 +157,8 @@ def loop_config(name: str):
 
 
 def start(tmp_path: Path, name: str) -> Path:
-    return new_run(tmp_path, "test", name, name, {"seed": 0})
+    open_run(tmp_path / name, {"learner": name})
+    return tmp_path / name
 
 
 FREE = Limits(None, None, None, None)
@@ -188,10 +189,10 @@ def test_it_goes_on_bit_for_bit(tmp_path):
     whole, cut = start(tmp_path, "whole"), start(tmp_path, "cut")
     straight = train_policy(task, learner, config, whole, limits=FREE)
     train_policy(task, learner, config, cut, limits=FREE, until=3)
-    resumed = train_policy(task, learner, config, cut, limits=FREE, resume=True)
+    resumed = train_policy(task, learner, config, cut, limits=FREE)
     assert numbers(whole) == numbers(cut)
     jax.tree.map(np.testing.assert_array_equal, straight.params, resumed.params)
-    assert json.loads((cut / "run.json").read_text())["status"] == "finished"
+    assert json.loads((cut / "outcome.json").read_text())["status"] == "finished"
 
 
 def test_beyond_the_limit_the_last_parameters_within_it_are_kept(tmp_path):
@@ -202,7 +203,7 @@ def test_beyond_the_limit_the_last_parameters_within_it_are_kept(tmp_path):
     )
     assert outcome.stopped is not None and "max_kl = 0.3" in outcome.stopped and outcome.iterations < 30
     assert outcome.kl == pytest.approx(seen[-1]["objective/kl"], rel=1e-5) and outcome.kl <= 0.3
-    assert "max_kl" in json.loads((run / "run.json").read_text())["stopped_because"]
+    assert "max_kl" in json.loads((run / "outcome.json").read_text())["why"]
 
 
 def test_signs_of_over_optimisation():

@@ -1,4 +1,4 @@
-"""The files of a run that trains a policy: what was asked for, the log, checkpoints from which it goes on bit for bit, and the result."""
+"""The files of a run that trains a policy, beside ``run.json``: the log, and checkpoints from which it goes on bit for bit."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -6,11 +6,10 @@ from typing import NamedTuple, cast
 
 from jaxtyping import PyTree
 
-from thorndike.errors import UserError
 from thorndike.language.over_optimisation import Watch
 from thorndike.training.checkpoints import newest
-from thorndike.training.json_files import NUMBER, SECONDS, Json, as_bytes, check_fields, optional, parse_object, quoted, whole
-from thorndike.training.run_directory import append_lines, checkpoints, facts, new_run_directory, truncate_lines, write_json
+from thorndike.training.json_files import NUMBER, SECONDS, Json, as_bytes, check_fields, optional, parse_object, whole
+from thorndike.training.run_directory import append_lines, checkpoints, truncate_lines, write_json
 from thorndike.training.sealed_folders import NewFolder, SealedFolder, discard
 from thorndike.training.tensorboard import EventWriter
 from thorndike.training.tree_files import read_tree, write_tree
@@ -26,17 +25,9 @@ class Progress(NamedTuple):
     wall_s: float
 
 
-def new_run(output: Path, task: str, learner: str, name: str | None, request: Mapping[str, object]) -> Path:
-    """A new run's directory, with what was asked for in ``run.json``."""
-    run = new_run_directory(output, task, learner, name)
-    write_json(run / "run.json", {**facts(), "kind": "language", "algorithm": learner, "environment": task, "status": "running", **request})
-    return run
-
-
-def set_status(run: Path, status: str, content: Mapping[str, object]) -> None:
-    """Write into ``run.json`` how a run ended."""
-    before = parse_object((run / "run.json").read_bytes(), run / "run.json")
-    write_json(run / "run.json", {**before, "status": status, **content})
+def set_outcome(run: Path, content: Mapping[str, object]) -> None:
+    """Write how a run ended into ``outcome.json``."""
+    write_json(run / "outcome.json", content)
 
 
 def save_progress(run: Path, tree: PyTree, progress: Progress) -> None:
@@ -52,7 +43,13 @@ def save_progress(run: Path, tree: PyTree, progress: Progress) -> None:
 
 
 def load_progress(run: Path, like: PyTree) -> tuple[PyTree, Progress]:
-    """The newest intact checkpoint; later lines of the log are dropped. Raises ``UserError`` if there is none."""
+    """The newest intact checkpoint, or where there is none ``like`` itself; later lines of the log are dropped.
+
+    Raises ``UserError`` if there are some, and all are damaged.
+    """
+    if not checkpoints(run):
+        truncate_lines(run / "metrics.jsonl", 0)
+        return like, Progress(0, Watch(), 0.0)
 
     def read(folder: SealedFolder) -> tuple[PyTree, Progress]:
         return read_tree(like, folder, _STATE), _read_progress(folder)
@@ -60,14 +57,6 @@ def load_progress(run: Path, like: PyTree) -> tuple[PyTree, Progress]:
     tree, progress = newest(run, read)
     truncate_lines(run / "metrics.jsonl", progress.iteration)
     return tree, progress
-
-
-def refuse_other_request(run: Path, request: Mapping[str, object]) -> None:
-    """Raises ``UserError`` where a run was asked for something else than is asked now: it would go on as a run nobody could repeat."""
-    known = parse_object((run / "run.json").read_bytes(), run / "run.json")
-    for name, value in parse_object(as_bytes(request), "request").items():
-        if known.get(name) != value:
-            raise UserError(f"{run} was begun with {name} = {quoted(known.get(name))}, not {quoted(value)}; go on with that, or begin anew")
 
 
 class Log:

@@ -5,8 +5,9 @@ follows from the seed and the iteration's number.
 """
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
@@ -18,11 +19,11 @@ from jaxtyping import Array, Float, Key, PyTree
 from thorndike.language.decoder import Params
 from thorndike.language.generation import stop_tokens
 from thorndike.language.model import LanguageModel
-from thorndike.language.over_optimisation import Limits, Signals, Watch, mean_disagreement, mean_repetition, trouble, watched
+from thorndike.language.over_optimisation import Limits, Signals, mean_disagreement, mean_repetition, trouble, watched
 from thorndike.language.policy_descent import check_ratio
-from thorndike.language.policy_files import Log, Progress, load_progress, save_progress, set_status
+from thorndike.language.policy_files import Log, Progress, load_progress, save_progress, set_outcome
 from thorndike.language.policy_learner import PolicyLearner
-from thorndike.language.rewards import Score
+from thorndike.language.rewards import Score, checked_scores
 from thorndike.language.rollouts import (
     Distance,
     Prompts,
@@ -35,6 +36,8 @@ from thorndike.language.rollouts import (
     sample_rollout,
     scored,
 )
+from thorndike.training.run_lock import run_lock
+from thorndike.training.stopping import stop_requests
 
 Members = Callable[[Written], Float[np.ndarray, "E B"]]
 """The scores of each member of an ensemble of reward models."""
@@ -79,6 +82,8 @@ class Task:
     prompts: Prompts
     score: Score
     members: Members | None = None
+    shown: Mapping[str, Score] = field(default_factory=dict)
+    """Scores that are logged and not learnt from, by name."""
 
 
 NO_MORE_THAN_USUAL = Limits()
@@ -109,19 +114,23 @@ class Iteration(NamedTuple):
 
 def train_policy(
     task: Task, learner: PolicyLearner, config: LoopConfig, run: Path, *, seed: int = 0, limits: Limits = NO_MORE_THAN_USUAL,
-    checkpoint_every: int = 20, resume: bool = False, until: int | None = None, told: Told | None = None,
+    checkpoint_every: int = 20, until: int | None = None, told: Told | None = None,
 ) -> Outcome:  # fmt: skip
-    """Train to ``config.total_steps`` iterations, or to a limit; ``until`` pauses before, to be gone on from with ``resume``."""
+    """Train to ``config.total_steps`` iterations, or to a limit, from the newest checkpoint in ``run`` if there is one.
+
+    ``until`` pauses before, as an interruption does: called again, it goes on.
+    """
     key, began = jax.random.key(seed), time.perf_counter()
     state = learner.init(jax.random.fold_in(key, 2**31 - 1))
-    kept, kept_kl, progress = _copied(learner.params(state)), jnp.float32(0.0), Progress(0, Watch(), 0.0)
-    if resume:
-        (state, kept, kept_kl), progress = load_progress(run, (state, kept, kept_kl))
-    log, watch, stopped = Log(run), progress.watch, None
-    iteration, last = progress.iteration, config.total_steps if until is None else min(until, config.total_steps)
-    try:
+    (state, kept, kept_kl), progress = load_progress(run, (state, _copied(learner.params(state)), jnp.float32(0.0)))
+    iteration, watch, stopped = progress.iteration, progress.watch, None
+    with ExitStack() as stack:
+        stack.enter_context(run_lock(run))
+        log = Log(run)
+        stack.callback(log.close)
+        interrupted = stack.enter_context(stop_requests())
         while iteration < config.total_steps:
-            if iteration == last:
+            if iteration == until or interrupted() is not None:
                 save_progress(run, (state, kept, kept_kl), Progress(iteration, watch, _since(progress, began)))
                 return Outcome(kept, iteration, float(kept_kl), None)
             key_write, key_learn = jax.random.split(jax.random.fold_in(key, iteration))
@@ -147,9 +156,9 @@ def train_policy(
             if stopped is None:
                 kept, kept_kl = _copied(learner.params(state)), jnp.float32(found.signals.kl)
         save_progress(run, (state, kept, kept_kl), Progress(iteration, watch, _since(progress, began)))
-    finally:
-        log.close()
-    set_status(run, "finished" if stopped is None else "stopped", {"steps_done": iteration, "stopped_because": stopped})
+    set_outcome(
+        run, {"status": "finished" if stopped is None else "stopped", "iterations": iteration, "kl": float(kept_kl), "why": stopped}
+    )
     return Outcome(kept, iteration, float(kept_kl), stopped)
 
 
@@ -181,6 +190,8 @@ def write(task: Task, params: Params, config: LoopConfig, samples: int, key: Key
         "rollout/repetition": signals.repetition,
         "rollout/ended": float(written.ended.mean()),
     }
+    for name, shown in task.shown.items():
+        metrics[f"objective/{name}"] = float(checked_scores(shown, written.prompts, written.completions, written.ids).mean())
     if signals.disagreement is not None:
         metrics["objective/disagreement"] = signals.disagreement
     return Iteration(rollout, found, jnp.asarray(score, jnp.float32), signals, metrics)
