@@ -30,7 +30,8 @@ def config_of(size: str) -> ModelConfig:
     return parse_model_config(
         {
             "model_type": "llama", "vocab_size": vocabulary, "hidden_size": width, "num_hidden_layers": layers,
-            "num_attention_heads": heads, "num_key_value_heads": heads, "intermediate_size": inner, "max_position_embeddings": 512, "tie_word_embeddings": True,
+            "num_attention_heads": heads, "num_key_value_heads": heads, "intermediate_size": inner,
+            "max_position_embeddings": 512, "tie_word_embeddings": True,
             "pad_token_id": 0, "bos_token_id": 1, "eos_token_id": 2,
         }
     )  # fmt: skip

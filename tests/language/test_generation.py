@@ -11,6 +11,7 @@ from language.make_reference import REFERENCE
 from thorndike.errors import UserError
 from thorndike.language.decoder import hidden_states, token_log_probs
 from thorndike.language.generation import (
+    AS_TRAINED,
     GREEDY,
     Generated,
     Sampling,
@@ -31,7 +32,7 @@ PROMPTS = [[5, 6, 7], [9], [20, 21, 22, 23, 24]]
 NEW = 12
 
 
-def run(sampling: Sampling = Sampling(), stops: tuple[int, ...] = (), samples: int = 1, seed: int = 0) -> Generated:  # noqa: B008
+def run(sampling: Sampling = AS_TRAINED, stops: tuple[int, ...] = (), samples: int = 1, seed: int = 0) -> Generated:
     tokens, segments = left_padded(PROMPTS, 0)
     return generate(
         PARAMS, CONFIG, tokens, segments, jax.random.key(seed), max_new_tokens=NEW, sampling=sampling, stop_tokens=stops, samples=samples

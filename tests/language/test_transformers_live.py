@@ -1,4 +1,4 @@
-"""With transformers installed (``pip install 'thorndike[reference]'``): it loads what is written here, and the references are its answers still."""
+"""With transformers installed (``pip install 'thorndike[reference]'``): it loads what is written here; the references are its answers."""
 
 import json
 from pathlib import Path

@@ -33,15 +33,13 @@ def run(words: Sequence[str]) -> Answer:
     parser.add_argument("--seed", type=seed_number, default=0, help="the number that dice and random moves follow from (default: 0)")
     add_output_argument(parser)
     options = parser.parse(words)
-    check_game(options.game, alone=True)
     against = options.against
-    if options.game == "2048":
+    if check_game(options.game, alone=True):
         if against is not None or options.second:
-            raise UserError("2048 is played by one: leave --against and --second out")
+            raise UserError(f"{options.game} is played by one: leave --against and --second out")
     else:
-        default = "random" if options.game == "backgammon" else "mcts"
-        shipped = trained_run(options.game) if against is None else None
-        against = shipped or choose_player(default if against is None else against, options.game, options.output)
+        default = "trained" if trained_run(options.game) else "random" if options.game == "backgammon" else "mcts"
+        against = choose_player(default if against is None else against, options.game, options.output)
     playing = _begin(options.game, against, options.simulations, options.second, options.seed)
     try:
         playing.go()
@@ -53,12 +51,14 @@ def run(words: Sequence[str]) -> Answer:
 def _begin(game: str, against: str | Path | None, simulations: int, second: bool, seed: int) -> "TerminalGame":
     from thorndike.api.playing import player
     from thorndike.cli.terminal_game import TerminalGame
+    from thorndike.games.engines import is_engine
     from thorndike.games.registry import game as find_game
 
     rules = find_game(game)
-    opponent = None if against is None else player(against, rules, simulations=simulations, seed=seed)
+    opponent = None if against is None else player(against, game, simulations=simulations, seed=seed)
     can_be_searched = rules.num_players == 2 and not rules.has_chance
     adviser = opponent if opponent is not None and opponent.name != "random" else None
     if adviser is None and can_be_searched:
         adviser = player("mcts", rules, simulations=max(simulations, 1), seed=seed)
-    return TerminalGame(rules, opponent, adviser, 1 if second else 0, seed)
+    compiles = opponent is not None and not (isinstance(against, str) and is_engine(against))
+    return TerminalGame(rules, opponent, adviser, 1 if second else 0, seed, compiles)

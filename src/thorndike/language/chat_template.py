@@ -33,12 +33,13 @@ def render(template: str, messages: Sequence[Message], special_texts: Mapping[st
 class _Generation(jinja2.ext.Extension):
     """``{% generation %} ... {% endgeneration %}`` marks what the assistant says; the text is as if it were not there."""
 
-    tags = {"generation"}  # noqa: RUF012
-
     def parse(self, parser: jinja2.parser.Parser) -> list[jinja2.nodes.Node]:
         """The statements inside."""
         next(parser.stream)
         return parser.parse_statements(("name:endgeneration",), drop_needle=True)
+
+
+_Generation.tags = {"generation"}
 
 
 class _Namespace(jinja2.utils.Namespace):
