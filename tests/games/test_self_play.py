@@ -17,6 +17,8 @@ from thorndike.games.settings import GameSettings
 from thorndike.games.tic_tac_toe import TIC_TAC_TOE
 from thorndike.replay.self_play import Rows, add_self_play, init_self_play, outcomes, sample_self_play
 
+pytestmark = pytest.mark.usefixtures("quick_compile")
+
 KEY = jax.random.key(0)
 STEPS, GAMES, LENGTH, LONGEST = 24, 3, 4, 9
 """The ring's steps, games side by side, steps written at once, the longest game."""
