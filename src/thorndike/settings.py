@@ -130,6 +130,12 @@ def check(config: object) -> None:
         check_value(getattr(config, facts.name), facts, where)
 
 
+def settings_of(config: object) -> dict[str, object]:
+    """The fields of a Config dataclass by name, as a run records them."""
+    kind: type = type(config)
+    return {field.name: getattr(config, field.name) for field in fields(kind)}
+
+
 def parse_settings(texts: Iterable[str], known: Mapping[str, FieldFacts], algorithm: str) -> dict[str, object]:
     """``["gamma=0.9", ...]`` as values of the declared types; of a name given twice the last counts.
 

@@ -127,6 +127,7 @@ def test_a_loss_that_is_not_finite_ends_the_run(tmp_path: Path) -> None:
     assert not (tmp_path / "run" / "checkpoints").exists()
 
 
+@pytest.mark.slow
 def test_from_a_text_file_to_a_model_that_has_learnt_an_answer(tmp_path: Path) -> None:
     """The whole way: a tokenizer and a model from a text, then fine-tuning on one answer, whole and as an adapter."""
     sentences = [

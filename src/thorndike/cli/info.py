@@ -21,6 +21,7 @@ OPTIONAL = {
     "imageio-ffmpeg": "video",
     "pygame-ce": "video",
     "nicegui": "web",
+    "tokenizers": "language",
 }
 """Package -> the extra that brings it."""
 

@@ -35,6 +35,7 @@ VERBS: dict[str, Verb] = {
     "studio": Verb("thorndike.cli.studio", "", "play games in the browser, on this machine"),
     "arena": Verb("thorndike.cli.arena", "GAME PLAYER PLAYER...", "let agents and programs play each other, and rate them"),
     "play": Verb("thorndike.cli.play", "GAME", "play a game against an agent or a program, here in the terminal"),
+    "language": Verb("thorndike.cli.language", "VERB ...", "language models: generate, chat, pretrain, fine-tune, preferences of people"),
     "check-env": Verb("thorndike.cli.check_env", "ENVIRONMENT", "say what is wrong with an environment, with fixes"),
     "list": Verb("thorndike.cli.list", "[WHAT]", "list runs, algorithms, environments, presets or settings"),
     "show": Verb("thorndike.cli.show", "RUN", "show a run's settings, state and last results"),
@@ -59,6 +60,7 @@ examples:
   thorndike watch latest                           see it act
   thorndike plot latest                            draw its learning curve
   thorndike compare ppo-run dqn-run                which is better, and how sure is that
+  thorndike language chat MODEL                    talk with a language model
   thorndike studio                                 play against what was trained, in the browser
   thorndike sweep ppo CartPole-v1 --over learning_rate=1e-4,3e-4,1e-3
                                                    which settings are best, and which matter

@@ -1,7 +1,6 @@
 """Fine-tuning a model's folder on rows of text, prompts with completions, or conversations: data, ``sft``, a run's directory."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
 from pathlib import Path
 
 import jax
@@ -15,6 +14,7 @@ from thorndike.language.packing import PackedRows, batch_at, packed
 from thorndike.language.pretraining import held_out_loss
 from thorndike.language.sft import Config, TextBatch, sft
 from thorndike.language.text_run import MODEL, TextOutcome, TextPlan, open_run, run_learner
+from thorndike.settings import settings_of
 
 ADAPTER = "adapter"
 
@@ -66,12 +66,6 @@ def fine_tune(
             save_adapter(Adapter(lora, outcome.state.trained), model.config, out / ADAPTER, str(folder.absolute()))
         save_model(model._replace(params=learner.params(outcome.state, frozen)), out / MODEL)
     return outcome
-
-
-def settings_of(config: object) -> dict[str, object]:
-    """The fields of a Config dataclass, as they are recorded."""
-    kind: type = type(config)
-    return {field.name: getattr(config, field.name) for field in fields(kind)}
 
 
 def _rows(paths: Sequence[Path], model: LanguageModel, length: int) -> PackedRows:

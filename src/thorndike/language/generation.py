@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from thorndike.errors import UserError
 from thorndike.functional.token_sampling import sample_tokens
+from thorndike.language.data import Text, prompt_tokens
 from thorndike.language.decoder import Cache, Params, decode_step, logits, prefill
 from thorndike.language.model import LanguageModel
 from thorndike.language.model_config import ModelConfig
@@ -111,7 +112,7 @@ def stream(
 
 def generate_texts(
     model: LanguageModel,
-    prompts: Sequence[str],
+    prompts: Sequence[Text],
     *,
     max_new_tokens: int = 64,
     sampling: Sampling = Sampling(),
@@ -119,8 +120,8 @@ def generate_texts(
     seed: int = 0,
     batch_size: int = 64,
 ) -> list[list[str]]:
-    """``samples`` continuations of every prompt."""
-    encoded = [model.tokenizer.encode(prompt) or [_begin_token(model)] for prompt in prompts]
+    """``samples`` continuations of every prompt, a text or a conversation."""
+    encoded = [prompt_tokens(prompt, model.tokenizer) or [_begin_token(model)] for prompt in prompts]
     answers: list[list[str]] = []
     for number, start in enumerate(range(0, len(encoded), batch_size)):
         part = encoded[start : start + batch_size]

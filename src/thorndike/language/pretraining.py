@@ -1,8 +1,10 @@
 """Pre-training a small model from nothing: a tokenizer of the corpus's own, a Llama-shaped decoder, ``sft`` on plain text."""
 
+import hashlib
+import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -21,7 +23,8 @@ from thorndike.language.sft import Config as SftConfig
 from thorndike.language.sft import TextBatch, sft
 from thorndike.language.text_run import MODEL, TextOutcome, TextPlan, open_run, run_learner
 from thorndike.language.tokenizer import Tokenizer, new_tokenizer
-from thorndike.settings import AtLeast, Between, check
+from thorndike.settings import AtLeast, Between, check, settings_of
+from thorndike.startup import cache_directory
 from thorndike.types import Metrics
 
 BEGIN, END, PAD = "<s>", "</s>", "<pad>"
@@ -50,10 +53,13 @@ class Config:
             raise UserError(f"pretraining: hidden_size {self.hidden_size} must be an even multiple of num_heads {self.num_heads}")
 
 
+DEFAULT = Config()
+
+
 def pretrain(source: str, out: Path, config: Config, seed: int = 0, progress: bool = True) -> TextOutcome:
     """Learn from a corpus (see ``read_corpus``) into a run's directory with a Hugging Face folder ``model``; go on where it stopped."""
     corpus = read_corpus(source)
-    settings = {field.name: getattr(config, field.name) for field in fields(config)}
+    settings = settings_of(config)
     open_run(out, {"verb": "pretrain", "corpus": source, "sha256": corpus.sha256, "seed": seed, "settings": settings})
     tokenizer = train_tokenizer(corpus.train, config.vocab_size)
     model_config = small_llama(config, tokenizer)
@@ -78,6 +84,15 @@ def pretrain(source: str, out: Path, config: Config, seed: int = 0, progress: bo
     if outcome.status == "finished" and not (out / MODEL).exists():
         save_model(LanguageModel(model_config, outcome.state.trained, tokenizer), out / MODEL)
     return outcome
+
+
+def base_model(corpus: str = MOVIE_REVIEWS, config: Config = DEFAULT, seed: int = 0, progress: bool = True) -> Path:
+    """The folder of a small model of a corpus; made at its first use (10 CPU-minutes), then kept in Thorndike's cache directory."""
+    asked = json.dumps([settings_of(config), seed], sort_keys=True)
+    run = cache_directory() / "language" / f"{Path(corpus).stem}-{hashlib.sha256(asked.encode()).hexdigest()[:12]}"
+    if not (run / MODEL / "config.json").exists() and pretrain(corpus, run, config, seed, progress).status != "finished":
+        raise UserError(f"making the base model was interrupted; the same command goes on from where it stopped ({run})")
+    return run / MODEL
 
 
 def train_tokenizer(texts: Sequence[str], vocab_size: int) -> Tokenizer:

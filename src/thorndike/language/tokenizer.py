@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from thorndike.language.chat_template import Message
 
 FILE = "tokenizer.json"
+_BATCH = 512
 _COPIED = (
     FILE, "tokenizer_config.json", "special_tokens_map.json", "chat_template.jinja", "vocab.json", "merges.txt", "tokenizer.model",
     "added_tokens.json",
@@ -51,7 +52,9 @@ class Tokenizer:
 
     def encode_many(self, texts: Sequence[str], special: bool = True) -> list[list[int]]:
         """The same of many texts at once."""
-        return [list(each.ids) for each in self.inner.encode_batch(list(texts), add_special_tokens=special)]
+        # Some at a time: what the package keeps of a text is far larger than its tokens.
+        parts = (list(texts[begin : begin + _BATCH]) for begin in range(0, len(texts), _BATCH))
+        return [list(each.ids) for part in parts for each in self.inner.encode_batch(part, add_special_tokens=special)]
 
     def decode(self, tokens: Iterable[int], special: bool = False) -> str:
         """The text of tokens; with ``special``, the names of special tokens are kept in it."""

@@ -1,0 +1,93 @@
+"""Arguments that the verbs of language models share; nothing heavy is imported for them."""
+
+import argparse
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TypeVar
+
+from thorndike.cli.parser import Parser
+from thorndike.config_fields import fields_in_source
+from thorndike.errors import UserError
+from thorndike.settings import FieldFacts, describe_kind, parse_settings
+from thorndike.startup import choose_device
+
+Config = TypeVar("Config")
+DEVICES = ("auto", "cpu", "gpu")
+_LARGE = 64 * 2**20
+"""Bytes of parameters above which a model runs on whatever JAX finds fastest, on all processors."""
+
+
+def add_model_argument(parser: Parser) -> None:
+    """The model's folder, and the device."""
+    parser.add_argument("model", metavar="MODEL", type=Path, help="a folder as transformers' save_pretrained writes it")
+    parser.add_argument("--adapter", metavar="DIR", type=Path, help="a LoRA adapter in PEFT's format, merged into the model")
+    add_device_argument(parser)
+
+
+def add_device_argument(parser: Parser) -> None:
+    """Where it is computed."""
+    parser.add_argument("--device", choices=DEVICES, default="auto", help="where it is computed (default: chosen by the model's size)")
+
+
+def add_sampling_arguments(parser: Parser, new_tokens: int) -> None:
+    """How tokens are chosen."""
+    parser.add_argument("--temperature", type=_at_least_zero, default=1.0, metavar="T", help="0: always the likeliest token (default: 1)")
+    parser.add_argument("--top-k", type=_whole_at_least_zero, default=0, metavar="K", help="among the K likeliest; 0: all (default: 0)")
+    parser.add_argument(
+        "--top-p", type=_at_least_zero, default=1.0, metavar="P", help="among the likeliest that make up P together (default: 1)"
+    )
+    parser.add_argument("--max-new-tokens", type=int, default=new_tokens, metavar="N", help=f"at most (default: {new_tokens})")
+
+
+def add_settings_argument(parser: Parser) -> None:
+    """``--set NAME=VALUE``."""
+    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", dest="settings", help="a setting; may be repeated")
+
+
+def given_settings(texts: list[str], module: str) -> dict[str, object]:
+    """The settings of ``language/<module>.py`` that were given. Raises ``UserError``, before anything heavy is imported."""
+    return parse_settings(texts, known_settings(module), module)
+
+
+def configured(config_class: Callable[..., Config], settings: Mapping[str, object]) -> Config:
+    """A Config with the settings that were given."""
+    return config_class(**settings)
+
+
+def known_settings(module: str) -> Mapping[str, FieldFacts]:
+    """The fields of the Config in ``language/<module>.py``, read from its source."""
+    source = Path(__file__).parents[2] / "language" / f"{module}.py"
+    return fields_in_source(source.read_text(encoding="utf-8"))
+
+
+def settings_in_words(module: str) -> str:
+    """The settings as lines of a verb's help."""
+    facts = known_settings(module).values()
+    return "\n".join(f"  {each.name} = {each.default}  {each.comment or describe_kind(each.kind)}" for each in facts)
+
+
+def prepare_device(device: str, model: Path | None) -> None:
+    """Choose the device by the size of a model's files. Raises ``UserError`` where there is no model, or no such device."""
+    large = False
+    if model is not None:
+        if not (model / "config.json").is_file():
+            raise UserError(f"{model} is no model: it has no config.json; give a folder as transformers' save_pretrained writes it")
+        large = sum(path.stat().st_size for path in model.glob("*.safetensors")) > _LARGE
+    choose_device(device, large)
+
+
+def _at_least_zero(text: str) -> float:
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not 0.0 <= number < math.inf:
+        raise argparse.ArgumentTypeError(f"expected a number of at least 0; got '{text}'")
+    return number
+
+
+def _whole_at_least_zero(text: str) -> int:
+    if not text.isdecimal() or not text.isascii():
+        raise argparse.ArgumentTypeError(f"expected a whole number of at least 0; got '{text}'")
+    return int(text)
