@@ -181,9 +181,10 @@ POLICY = ["ppo", "trpo", "a2c", "a3c", "impala", "reinforce"]
 VALUE = ["dqn", "rainbow", "qr_dqn", "iqn", "pqn", "bootstrapped_dqn"]
 CONTROL = ["sac", "td3", "ddpg", "tqc", "crossq", "redq"]
 FROM_DATA = ["bc", "cql", "iql", "td3_bc", "awac"]
+GAMES = ["alphazero"]
 
 
-@pytest.mark.parametrize("algorithm", [*POLICY, *VALUE, *CONTROL, *FROM_DATA])
+@pytest.mark.parametrize("algorithm", [*POLICY, *VALUE, *CONTROL, *FROM_DATA, *GAMES])
 def test_the_table_of_settings_is_that_of_the_code(algorithm):
     text = (ROOT / f"docs/algorithms/{algorithm}.md").read_text(encoding="utf-8")
     section = text.partition("## Settings")[2].partition("\n## ")[0]

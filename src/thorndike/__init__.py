@@ -44,6 +44,7 @@ _PUBLIC = {
     "TD3BC": "thorndike.api",
     "AWAC": "thorndike.api",
     "QLearning": "thorndike.api",
+    "AlphaZero": "thorndike.api",
     "make": "thorndike.api",
     "evaluate": "thorndike.api",
     "check_env": "thorndike.api.checking",

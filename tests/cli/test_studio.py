@@ -24,10 +24,16 @@ def test_a_wrong_port_is_one_line(port, capsys):
     )
 
 
-def test_a_missing_extra_is_one_line(capsys, monkeypatch):
-    monkeypatch.setattr(studio, "find_spec", lambda name: None)
+@pytest.mark.parametrize("missing", ["nicegui", "mctx"])
+def test_a_missing_extra_is_one_line(missing, capsys, monkeypatch):
+    monkeypatch.setattr(studio, "find_spec", lambda name: None if name == missing else object())
     assert main(["studio"]) == 2
-    assert capsys.readouterr().err == "thorndike: the studio needs NiceGUI, which is not installed: pip install 'thorndike[web]'\n"
+    assert capsys.readouterr().err == f"thorndike: the studio needs {missing}, which is not installed: pip install 'thorndike[web,games]'\n"
+
+
+def test_a_game_that_is_not_there_is_one_line(capsys):
+    assert main(["studio", "--game", "no_file.py:GAME"]) == 2
+    assert capsys.readouterr().err == "thorndike: there is no file no_file.py: give the path of the file that defines the game\n"
 
 
 def test_a_port_that_is_taken_is_one_line(capsys):

@@ -169,6 +169,15 @@ def test_looking_back_changes_nothing_and_playing_there_is_refused():
     assert table.view().at_end and len(table.view().moves) == 3
 
 
+def test_playing_on_from_an_earlier_position_leaves_out_what_came_after():
+    table = played(persons(), (0, 0), (1, 0), (0, 1), (1, 1), (0, 2))
+    table.show(3)
+    table.play_on_from_here()
+    assert table.view().moves == (0, 3, 1) and table.view().at_end and table.view().outcome is None
+    table.click((0, 2))
+    assert table.view().names[-1] == "c3"
+
+
 def test_the_analyst_searches_the_position_looked_at():
     table = Table(TIC_TAC_TOE, (person("A"), person("B")), analyst=computer(Player("First", lowest)))
     table.analyse(True)

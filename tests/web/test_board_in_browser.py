@@ -8,6 +8,9 @@ import pytest
 pytest.importorskip("nicegui")
 from playwright.sync_api import Page, expect
 
+# The machine may be busy with other tests.
+expect.set_options(timeout=20_000)
+
 
 def start(page: Page, studio, game="tic_tac_toe", opponent=None, strength=None, begins=None) -> Page:
     page.goto(f"{studio.root}/new/{game}")
@@ -43,6 +46,8 @@ def tab_to(page: Page, selector: str) -> None:
 def test_a_game_of_tic_tac_toe_by_clicks(page, studio):
     start(page, studio, opponent="first")
     expect(status(page)).to_have_text("Your turn: you are X")
+    shown = [each for each in page.get_by_role("group", name="Game", exact=True).get_by_role("button").all_inner_texts() if each]
+    assert shown == ["Take back", "Swap sides", "New game", "Save"]
     # The opponent takes a3, then b3, and is too late.
     for number, (row, column) in enumerate(((1, 1), (0, 2), (2, 0))):
         square(page, row, column).click()
@@ -235,6 +240,11 @@ def test_a_game_is_saved_and_replayed(page, studio, tmp_path):
     page.locator(".slider").press("ArrowRight")
     expect(status(page)).to_have_text("Position after move 2 of 4")
     expect(page.locator(".piece.first, .piece.second")).to_have_count(2)
+    page.once("dialog", lambda dialog: dialog.accept())
+    page.get_by_role("button", name="Play on from here").click()
+    expect(moves(page)).to_have_text(["d", "a"])
+    square(page, 0, 6).click()
+    expect(moves(page)).to_have_text(["d", "a", "g"])
     file.write_text(file.read_text().replace('"e"', '"z"'))
     page.goto(studio.root)
     page.locator("input[type=file]").set_input_files(file)

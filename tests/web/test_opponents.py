@@ -1,5 +1,7 @@
 """Who is offered for which game, and that they play."""
 
+from pathlib import Path
+
 import jax
 import pytest
 
@@ -7,6 +9,7 @@ from made_up_runs import write_run
 from thorndike.errors import UserError
 from thorndike.games.game import Turn
 from thorndike.games.registry import game
+from thorndike.games.saved_game import saved_game_file
 from thorndike.web import opponents as module
 from thorndike.web.opponents import PERSON, opponents_in
 from thorndike.web.studio import MOST_TABLES, Setup, Studio
@@ -24,18 +27,15 @@ def test_runs_of_this_game_come_first_the_newest_before_the_others(tmp_path):
     ):
         write_run(tmp_path / environment / "alphazero" / name, algorithm="alphazero", environment=environment, seeds=1)
     found = names("tic_tac_toe", tmp_path)
-    assert found[:3] == [
-        "Trained: alphazero, 20260102-000000-new",
-        "Trained: alphazero, 20260101-000000-old",
-        "Tree search, without a network",
-    ]
+    assert found[:2] == ["Trained: alphazero, 20260102-000000-new", "Trained: alphazero, 20260101-000000-old"]
+    assert found[2:4] == ["Trained: Thorndike's own", "Tree search, without a network"]
     assert found[-1] == "Random moves"
 
 
 def test_a_damaged_run_is_left_out(tmp_path):
     run = write_run(tmp_path / "a" / "20260101-000000-old", environment="tic_tac_toe", seeds=1)
     (run / "run.json").write_text("{")
-    assert names("tic_tac_toe", tmp_path)[0] == "Tree search, without a network"
+    assert names("tic_tac_toe", tmp_path)[0] == "Trained: Thorndike's own"
 
 
 def test_no_search_where_there_is_none_or_it_takes_too_long(tmp_path, monkeypatch):
@@ -91,3 +91,14 @@ def test_a_saved_game_of_another_studio_is_refused(rooms):
     text = b'{"format": "thorndike-game", "version": 1, "game": "chess", "seed": 0, "players": [], "moves": [], "win_probabilities": []}'
     with pytest.raises(UserError, match="holds a game of chess, which this studio does not have"):
         rooms.open_saved(text, "the file")
+
+
+def test_a_game_of_ones_own_is_played_and_saved_and_opened(tmp_path):
+    name = f"{Path(__file__).parents[2] / 'examples/own_game.py'}:NIM"
+    offered = opponents_in(tmp_path)
+    assert [each.id for each in offered(name)] == ["mcts", "random"]
+    rooms = Studio((name,), offered)
+    place = rooms.place(rooms.open(Setup(name)))
+    view = place.table.view()
+    data = saved_game_file(place.table.game, 0, ["A", "B"], view.names, view.choices)
+    assert rooms.place(rooms.open_saved(data, "the file")).setup.game == name

@@ -270,3 +270,9 @@ class QLearning(Learner):
     """Tabular Q-learning and its relatives."""
 
     algorithm = "q_learning"
+
+
+class AlphaZero(Learner):
+    """A game of two, learnt by playing oneself."""
+
+    algorithm = "alphazero"

@@ -12,42 +12,51 @@ from thorndike.cli.parser import Parser
 from thorndike.errors import UserError
 
 PORT = 8420
+_OPEN_TO_OTHERS = """\
+Other machines reach it by this machine's address, with the same token. Nothing is encrypted: use it in networks that you trust."""
 EXAMPLES = """\
   thorndike studio                   print an address to open in a browser; Ctrl-C ends the studio
   thorndike studio --open            open it, too
-  thorndike studio --port 0          on any port that is free"""
+  thorndike studio --port 0          on any port that is free
+  thorndike studio --game examples/own_game.py:NIM"""
 
 
 def run(words: Sequence[str]) -> Answer:
     """Serve the studio until the process is asked to stop."""
     parser = Parser("studio", "Play games in the browser, against what was trained, a search, or each other.", EXAMPLES)
-    parser.add_argument("--port", metavar="N", type=_port, default=PORT, help=f"where to listen; 0: any free one (default: {PORT})")
+    parser.add_argument("--port", metavar="N", type=port_number, default=PORT, help=f"where to listen; 0: any free one (default: {PORT})")
     parser.add_argument("--open", action="store_true", help="open the address in this machine's browser")
     host_help = "another address of this machine, to be reached from others (default: 127.0.0.1, this machine only)"
     parser.add_argument("--host", metavar="ADDRESS", default="127.0.0.1", help=host_help)
+    game_help = "a game of your own, as module:NAME or path/to/file.py:NAME; may be given several times"
+    parser.add_argument("--game", metavar="NAME", action="append", default=[], help=game_help)
     add_output_argument(parser)
     options = parser.parse(words)
-    if find_spec("nicegui") is None:
-        raise UserError("the studio needs NiceGUI, which is not installed: pip install 'thorndike[web]'")
+    for package in ("nicegui", "mctx"):
+        if find_spec(package) is None:
+            raise UserError(f"the studio needs {package}, which is not installed: pip install 'thorndike[web,games]'")
 
-    from thorndike.games.registry import ADAPTED_GAMES, OWN_GAMES
+    from thorndike.games.registry import ADAPTED_GAMES, OWN_GAMES, game
     from thorndike.web.opponents import opponents_in
     from thorndike.web.server import serve
 
     def told(address: str) -> None:
         print(f"The studio is at {address}", flush=True)
-        if options.host != "127.0.0.1":
-            print("Whoever has this address can play here: it is not encrypted, so use it in networks that you trust.", file=sys.stderr)
+        if options.host not in ("127.0.0.1", "::1", "localhost"):
+            print(_OPEN_TO_OTHERS, file=sys.stderr)
         print("Ctrl-C ends it.", file=sys.stderr, flush=True)
         if options.open:
             webbrowser.open(address)
 
-    games = (*OWN_GAMES, *(ADAPTED_GAMES if find_spec("pgx") is not None else ()))
+    for name in options.game:
+        game(name)
+    games = (*OWN_GAMES, *(ADAPTED_GAMES if find_spec("pgx") is not None else ()), *options.game)
     serve(games, opponents_in(options.output), options.host, options.port, told)
     return Answer({"status": "ended"}, "")
 
 
-def _port(text: str) -> int:
+def port_number(text: str) -> int:
+    """A port, or 0 for any that is free."""
     if not (text.isascii() and text.isdecimal() and len(text) <= 5 and int(text) < 2**16):
         raise ArgumentTypeError(f"expected a port from 0 (any free one) to 65535; got '{text}'")
     return int(text)

@@ -42,9 +42,9 @@ class SearchSettings(NamedTuple):
     """Of ``puct``: weight of the prior."""
     considered_moves: int = 16
     """Of ``gumbel``: moves tried at the root."""
-    value_scale: float = 0.1
-    """Of ``gumbel``: c_scale, the weight of values against the prior."""
-    rescale_values: bool = True
+    value_scale: float = 0.5
+    """Of ``gumbel``: c_scale, the weight of values against the prior; 0.5 is the paper's 1 for values in [0, 1]."""
+    rescale_values: bool = False
     """Of ``gumbel``: stretch the values of a node's moves to [0, 1] first."""
 
 

@@ -111,7 +111,7 @@ def _main_line(text: str, where: str) -> list[dict[str, list[str]]]:
             nodes.append({})
         elif token["name"]:
             name = "".join(letter for letter in token["name"] if letter.isupper())
-        elif nodes and name:
+        elif token["value"] is not None and nodes and name:
             nodes[-1].setdefault(name, []).append(_plain(token["value"]))
     else:
         raise UserError(f"{where} is no SGF record: it is not closed")

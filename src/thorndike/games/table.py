@@ -160,6 +160,13 @@ class Table:
             self._paused = self._seats[self._plies[-1].player].player is not None
             self._changed()
 
+    def play_on_from_here(self) -> None:
+        """Leave out all moves after the position that is looked at."""
+        with self._lock:
+            self._cut(self._shown)
+            self._paused = False
+            self._changed()
+
     def swap_sides(self) -> None:
         """Everybody takes the next seat; the moves stay."""
         with self._lock:
@@ -236,7 +243,9 @@ class Table:
         if self._outcome() is not None:
             raise UserError("the game is over: take a move back, or begin a new one")
         if self._shown != len(self._moves):
-            raise UserError(f"this is the position after move {self._shown} of {len(self._moves)}: go to the last one to play on")
+            raise UserError(
+                f"this is the position after move {self._shown} of {len(self._moves)}: go to the last one, or play on from here"
+            )
         seat = self._seats[self._plies[-1].player]
         if seat.player is not None and not self._paused:
             raise UserError(f"it is not your turn: {seat.name} is thinking")

@@ -71,6 +71,8 @@ class _BoardPage:
         with Tag("div", "actions", "", {"role": "group", "aria-label": "Game"}):
             self._stop = button("Stop thinking", self._doing(lambda: self._table.interrupt()), "primary")
             self._go_on = button("Let it play", self._doing(lambda: self._table.go_on()), "primary")
+            self._from_here = button("Play on from here", self._doing(lambda: self._table.play_on_from_here()), "primary", asks=True)
+            self._from_here.set_attribute("data-asks", "Play on from here? The moves after this one are lost.")
             self._take_back = button("Take back", self._doing(lambda: self._table.take_back()))
             swap = button("Swap sides", self._doing(lambda: self._studio.swap_sides(self._name)))
             swap.set_attribute("hidden", self._alone)
@@ -155,6 +157,7 @@ class _BoardPage:
         self._restart.set_attribute(
             "data-asks", "Begin a new game? The moves of this one are lost." if view.moves and not drawn.over else None
         )
+        self._from_here.set_attribute("hidden", True if view.at_end else None)
         self._take_back.set_attribute("disabled", None if view.moves else True)
         for number, (line, seat) in enumerate(zip(self._players, view.seats, strict=True)):
             line.set_text(f"{self._look.sides[number]}: {seat.name}")

@@ -1,5 +1,7 @@
 """The first page: the games there are, those being played, and a saved one to open."""
 
+from urllib.parse import quote
+
 from nicegui import run, ui
 
 from thorndike.games.saved_game import LARGEST
@@ -32,7 +34,7 @@ def add_home(studio: Studio) -> None:
             with Tag("ul", "cards", "", {"aria-label": "Games"}):
                 for game_id in studio.games:
                     look = look_of(game_id)
-                    with Tag("li"), link("", f"/new/{game_id}", "card"):
+                    with Tag("li"), link("", f"/new/{quote(game_id, safe='')}", "card"):
                         ui.html(game_icon(look.pieces), sanitize=False, tag="span")
                         Tag("strong", "", look.title)
                         Tag("span", "", look.rule)
@@ -46,7 +48,7 @@ def add_home(studio: Studio) -> None:
             Tag("p", "quiet", "Step through it, or go on from any of its moves.")
             open_file("Open a file…", ".json,application/json", LARGEST, opened)
 
-    @ui.page("/new/{game_id}")
+    @ui.page("/new/{game_id:path}")
     def new(game_id: str) -> None:
         if game_id not in studio.games:
             with frame("No such game"):

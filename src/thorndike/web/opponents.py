@@ -8,6 +8,8 @@ from thorndike.cli.find_run import all_runs, read_facts
 from thorndike.errors import UserError
 from thorndike.games.engines import ENGINES, program_of
 from thorndike.games.game import Game, Player
+from thorndike.games.registry import game as find_game
+from thorndike.games.trained import trained_run
 
 PERSON = "person"
 STRENGTHS = (16, 64, 200, 800, 3200)
@@ -32,42 +34,49 @@ Opponents: TypeAlias = Callable[[str], Sequence[Opponent]]
 
 ANOTHER_PERSON = Opponent(PERSON, "Another person, here", None)
 ALONE = Opponent(PERSON, "Nobody: one plays alone", None)
-ONE_PLAYER = ("2048",)
-"""Games for one."""
-_WITHOUT_SEARCH = (*ONE_PLAYER, "backgammon")
-"""Those, and games with dice."""
+_ONE_PLAYER, _WITH_DICE = ("2048",), ("backgammon",)
+"""Of the games with an id: to make some of them takes seconds."""
 _LONG = ("chess", "shogi", "go_19x19")
 """Games that take a search minutes to play out at random as often as it must."""
 _ENGINE_NAMES = {"gnugo": "GNU Go", "rhino": "grhino", "stockfish": "Stockfish", "fairy": "Fairy-Stockfish"}
+
+
+def is_for_one(game_id: str) -> bool:
+    """Whether one plays this game alone."""
+    return find_game(game_id).num_players == 1 if ":" in game_id else game_id in _ONE_PLAYER
 
 
 def opponents_in(output: Path) -> Opponents:
     """What was trained in a folder of runs, a plain search, programs that are installed, random moves."""
 
     def opponents(game_id: str) -> Sequence[Opponent]:
-        if game_id in ONE_PLAYER:
+        if is_for_one(game_id):
             return ()
-        searched = game_id not in _WITHOUT_SEARCH
+        searched = not (find_game(game_id).has_chance if ":" in game_id else game_id in _WITH_DICE)
         found = [
-            _named(str(run), f"{run.parent.name}, {run.name}", searched, "Trained: ")
+            _named(str(run), f"{run.parent.name}, {run.name}", searched, before="Trained: ")
             for run in reversed(all_runs(output))
             if _trained_on(run, game_id)
         ]
+        if (shipped := trained_run(game_id)) is not None:
+            found.append(_named(str(shipped), "Thorndike's own", searched, before="Trained: "))
         if searched and game_id not in _LONG:
-            found.append(_named("mcts", "Tree search, without a network", searches=True))
+            found.append(_named("mcts", "Tree search", searches=True, after=", without a network"))
         found += [_named(name, _ENGINE_NAMES.get(name, name)) for name in ENGINES if _plays(name, game_id)]
         return [*found, _named("random", "Random moves")]
 
     return opponents
 
 
-def _named(who: str, name: str, searches: bool = False, kind: str = "") -> Opponent:
+def _named(who: str, name: str, searches: bool = False, before: str = "", after: str = "") -> Opponent:
+    """``name`` is what it is called at the table; ``before`` and ``after`` are added where one chooses."""
+
     def make(game: Game, simulations: int) -> Player:
         from thorndike.api.playing import player
 
         return player(who, game, simulations=simulations)._replace(name=name)
 
-    return Opponent(who, kind + name, make, searches)
+    return Opponent(who, before + name + after, make, searches)
 
 
 def _trained_on(run: Path, game_id: str) -> bool:

@@ -102,7 +102,7 @@ def _hint(view: View) -> str:
     if view.paused and view.outcome is None:
         return "Let it go on, take a move back, or swap sides"
     if not view.at_end:
-        return "Go to the last move to play on"
+        return "Step through it, or play on from here"
     return "" if view.outcome is None else "Step back through it, or begin a new game"
 
 

@@ -2,7 +2,7 @@
 
 from thorndike.web.controls import Tag, select
 from thorndike.web.looks import look_of
-from thorndike.web.opponents import ONE_PLAYER, STRENGTHS
+from thorndike.web.opponents import STRENGTHS, is_for_one
 from thorndike.web.studio import Setup, Studio
 
 
@@ -14,7 +14,7 @@ class SetupForm:
         self._offered = {opponent.id: opponent for opponent in studio.opponents(setup.game)}
         sides = look_of(setup.game).sides
         with Tag("div", "fields") as fields:
-            fields.set_attribute("hidden", True if setup.game in ONE_PLAYER else None)
+            fields.set_attribute("hidden", True if is_for_one(setup.game) else None)
             self._opponent = select(
                 "Opponent", {each.id: each.name for each in self._offered.values()}, setup.opponent, self._choose_opponent
             )

@@ -12,7 +12,7 @@ from thorndike.games.registry import game as find_game
 from thorndike.games.saved_game import read_saved_game, saved_actions
 from thorndike.games.seats import Seat, computer, person
 from thorndike.games.table import Table
-from thorndike.web.opponents import ALONE, ANOTHER_PERSON, ONE_PLAYER, PERSON, STRENGTH, Opponent, Opponents
+from thorndike.web.opponents import ALONE, ANOTHER_PERSON, PERSON, STRENGTH, Opponent, Opponents, is_for_one
 
 MOST_TABLES = 100
 """The one that was not looked at for the longest time makes room."""
@@ -40,15 +40,17 @@ class Studio:
     """All tables. Every method may be called from any thread."""
 
     def __init__(self, games: Sequence[str], opponents: Opponents) -> None:
-        """``games``: the ids of those on offer; ``opponents``: who plays each of them, besides another person."""
+        """``games``: the ids, or names, of those on offer; ``opponents``: who plays each of them, besides another person."""
         self.games, self._opponents = tuple(games), opponents
+        # A file says what a game calls itself, which for a user's own is not the name it is found by.
+        self._by_id = {find_game(name).id if ":" in name else name: name for name in self.games}
         self._places: dict[str, Place] = {}
         self._seen: dict[str, float] = {}
         self._lock = threading.Lock()
 
     def opponents(self, game_id: str) -> tuple[Opponent, ...]:
         """Who plays a game, the likeliest choice first."""
-        return (*self._opponents(game_id), ALONE if game_id in ONE_PLAYER else ANOTHER_PERSON)
+        return (*self._opponents(game_id), ALONE if is_for_one(game_id) else ANOTHER_PERSON)
 
     def open(self, setup: Setup) -> str:
         """A new table; its name."""
@@ -62,14 +64,15 @@ class Studio:
     def open_saved(self, data: bytes, where: str) -> str:
         """A table with a saved game on it, between persons, looked at from its beginning; its name. Raises UserError for a wrong file."""
         saved = read_saved_game(data, where)
-        if saved.game not in self.games:
+        if saved.game not in self._by_id:
             raise UserError(f"{where} holds a game of {saved.game}, which this studio does not have")
-        game = find_game(saved.game)
+        name = self._by_id[saved.game]
+        game = find_game(name)
         actions, choices = saved_actions(game, saved)
         names = [*saved.players, "You", "You"][: game.num_players]
         table = Table(game, [person(name) for name in names], seed=saved.seed)
         table.replay(actions, choices)
-        return self._keep(Place(table, Setup(game.id)))
+        return self._keep(Place(table, Setup(name)))
 
     def change(self, name: str, setup: Setup) -> None:
         """Seat others at a table; the moves stay."""
