@@ -145,8 +145,8 @@ def test_preferences_go_into_a_store_and_come_out_as_they_were(tmp_path):
     with Store(tmp_path / "x.db") as store:
         project = store.project("p")
         records = check_records(rows, "rows")
-        assert import_records(store, project, records, "file", Plan(share_to_more=0)) == (40, 40)
-        assert import_records(store, project, records, "file", Plan(share_to_more=0)) == (0, 0), "again adds nothing"
+        assert import_records(store, project, records, "file", Plan(share_to_more=0)) == (40, 40, 0)
+        assert import_records(store, project, records, "file", Plan(share_to_more=0)) == (0, 0, 0), "again adds nothing"
         out = export_rows(store, project)
         texts = [{name: row[name] for name in ("prompt", "chosen", "rejected")} for row in out]
         assert texts == [{name: row[name] for name in ("prompt", "chosen", "rejected")} for row in rows]
@@ -154,16 +154,16 @@ def test_preferences_go_into_a_store_and_come_out_as_they_were(tmp_path):
         write_records(tmp_path / "out.jsonl", out)
         other = store.project("other")
         again = import_records(store, other, read_records(tmp_path / "out.jsonl"), "file", Plan(share_to_more=0))
-        assert again == (40, 40) and len(export_rows(store, other)) == 40
+        assert again == (40, 40, 0) and len(export_rows(store, other)) == 40
 
 
 def test_a_wrong_row_adds_nothing(tmp_path):
     with Store(tmp_path / "x.db") as store:
         project = store.project("p")
         rows = [{"prompt": "p", "candidates": ["a", "b"]}, {"prompt": "q", "candidates": ["a", "b"], "best": 5}]
-        with pytest.raises(UserError, match="row 2: 'best'"):
+        with pytest.raises(UserError, match="rows, row 2: 'best'"):
             import_records(store, project, check_records(rows, "rows"), "file", Plan())
-        with pytest.raises(UserError, match="one completion"):
+        with pytest.raises(UserError, match="rows, row 1: its prompt has one completion"):
             import_records(store, project, check_records([{"prompt": "p", "completion": "a"}], "rows"), "file", Plan())
         with pytest.raises(UserError, match="nothing to compare"):
             import_records(store, project, check_records([{"prompt": "p"}], "rows"), "file", Plan())
@@ -174,7 +174,7 @@ def test_completions_of_a_prompt_become_one_item_and_clips_are_items_too(tmp_pat
     with Store(tmp_path / "x.db") as store:
         project = store.project("p")
         rows = [{"prompt": f"p{each % 2}", "completion": f"c{each}", "model": f"m{each}"} for each in range(6)]
-        assert import_records(store, project, check_records(rows, "rows"), "file", Plan()) == (2, 0)
+        assert import_records(store, project, check_records(rows, "rows"), "file", Plan()) == (2, 0, 0)
         clips = [
             {
                 "prompt": {"text": "Which one walks?"},
@@ -183,8 +183,16 @@ def test_completions_of_a_prompt_become_one_item_and_clips_are_items_too(tmp_pat
                 "best": 1,
             }
         ]
-        assert import_records(store, project, check_records(clips, "rows"), "file", Plan()) == (1, 0)
+        assert import_records(store, project, check_records(clips, "rows"), "file", Plan()) == (1, 0, 0)
         assert [(len(each.candidates), each.best) for each in store.questions(project).values()] == [(3, None), (3, None), (2, 1)]
+
+
+def test_samples_that_are_the_same_are_compared_once_or_left_out(tmp_path):
+    with Store(tmp_path / "x.db") as store:
+        project = store.project("p")
+        rows = [{"prompt": "p", "completions": ["a", "a", "b"], "best": 2}, {"prompt": "q", "completions": ["a", "a"]}]
+        assert import_records(store, project, check_records(rows, "rows"), "file", Plan()) == (1, 0, 1)
+        assert [(len(each.candidates), each.best) for each in store.questions(project).values()] == [(2, 1)]
 
 
 @pytest.fixture(scope="module")

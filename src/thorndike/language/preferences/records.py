@@ -42,6 +42,12 @@ class Records(NamedTuple):
     rows: list[Row]
     numbers: list[int]
     """Where each row stands in the file: its line of JSON lines, else its place from 1, the heading of a CSV not counted."""
+    where: str
+    """The file."""
+
+    def places(self) -> list[str]:
+        """Each row's file and number, as messages have it."""
+        return [f"{self.where}, row {number}" for number in self.numbers]
 
 
 def read_records(path: str | Path) -> Records:
@@ -75,7 +81,7 @@ def check_records(rows: Sequence[Mapping[str, object]], where: str | Path, numbe
         checked.append(dict(row))
     if known is None:
         raise UserError(f"{where} holds no rows")
-    return Records(*known, checked, numbers)
+    return Records(*known, checked, numbers, str(where))
 
 
 def write_records(path: str | Path, rows: Iterable[Mapping[str, object]]) -> int:
