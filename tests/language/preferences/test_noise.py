@@ -3,11 +3,21 @@
 import numpy as np
 import pytest
 
-from language.preferences.made_up_crowd import accuracy, crowd_labels
 from thorndike.errors import UserError
 from thorndike.language.preferences.comparisons import Comparisons, Pair
 from thorndike.language.preferences.noise import believe, davidson, dawid_skene, majority, mean_labels
-from thorndike.language.preferences.raters import Rater
+from thorndike.language.preferences.raters import Rater, crowd, crowd_comparisons
+
+
+def crowd_labels(seed, pairs=2_000, labels=3, raters=None):
+    """Comparisons of pairs by a random few of the crowd each, and whether the first of each pair is better."""
+    utilities = np.random.default_rng(seed).normal(size=(pairs, 2))
+    return crowd_comparisons(utilities, crowd() if raters is None else raters, labels, seed), utilities[:, 0] > utilities[:, 1]
+
+
+def accuracy(first_is_better, truth):
+    """Of labels; a half for each that says nothing."""
+    return float(np.where(first_is_better == 0.5, 0.5, (first_is_better > 0.5) == truth).mean())
 
 
 def single_labels(comparisons):
