@@ -117,10 +117,10 @@ def test_mutated_files_are_read_whole_or_refused_in_one_line(files, ending, tmp_
         write_records(path, examples[each % len(examples)])
         data = bytearray(path.read_bytes())
         for _ in range(draws.randint(1, 4)):
-            place = draws.randrange(len(data))
+            place = draws.randrange(len(data) or 1)
             match draws.randrange(4):
                 case 0:
-                    data[place] = draws.randrange(256)
+                    data[place : place + 1] = bytes([draws.randrange(256)])
                 case 1:
                     del data[place : place + draws.randint(1, 20)]
                 case 2:
