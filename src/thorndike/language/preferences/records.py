@@ -120,16 +120,19 @@ def as_text(rows: Sequence[Row], ending: str, where: str | Path) -> str:
 def with_explicit_prompt(row: Mapping[str, object]) -> Row:
     """A preference whose prompt stands at the beginning of both answers, with the prompt on its own; another row as it is.
 
-    What both begin with: messages that are equal, or characters, without the space at the end, as TRL's ``extract_prompt`` has it.
+    What both begin with: messages that are equal, or characters, without the space at the end, as TRL's ``extract_prompt`` has it; but where nothing is
+    in common all stays an answer (TRL's cuts off the rest of an answer that ends in a space).
     """
     if "prompt" in row or not {"chosen", "rejected"} <= row.keys():
         return dict(row)
     chosen, rejected = row["chosen"], row["rejected"]
     assert isinstance(chosen, str | list) and isinstance(rejected, str | list)
     shorter = min(len(chosen), len(rejected))
-    # Where one begins with all of the other, the last part stays an answer: no answer is empty.
-    common = next((place for place in range(shorter) if chosen[place] != rejected[place]), shorter - 1)
-    if common > 0 and chosen[common - 1] == " ":
+    common = next((place for place in range(shorter) if chosen[place] != rejected[place]), None)
+    if common is None:
+        # One begins with all of the other: its last part stays an answer, so that none is empty.
+        common = shorter - 1
+    elif common > 0 and chosen[common - 1] == " ":
         common -= 1
     return {"prompt": chosen[:common], **row, "chosen": chosen[common:], "rejected": rejected[common:]}
 

@@ -1,0 +1,286 @@
+"""RLHF from end to end on one small model: reviews, a noisy crowd, a reward model of real people's ratings, PPO and its rivals, a report.
+
+Each stage keeps what it made in the run's directory, so that the command, given again, goes on where it stopped.
+"""
+
+import json
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from thorndike.errors import UserError
+from thorndike.language import dpo as direct
+from thorndike.language import grpo as groups
+from thorndike.language import ppo as proximal
+from thorndike.language.best_of_n import curve, sample_many
+from thorndike.language.comparisons import comparison_data
+from thorndike.language.decoder import Params
+from thorndike.language.demo_labels import as_comparisons, judge_pairs
+from thorndike.language.demo_reward import learn_from_ratings, rewards_of
+from thorndike.language.learner import State
+from thorndike.language.model import LanguageModel, save_model
+from thorndike.language.over_optimisation import Limits
+from thorndike.language.policy_training import Task, train_policy
+from thorndike.language.reward_files import RewardModel, load_reward_model, refuse_if_near_chance, save_reward_model
+from thorndike.language.rollouts import Prompts
+from thorndike.language.sentiment import Lexicon, Rated
+from thorndike.language.text_run import MODEL, open_run
+from thorndike.language.tokenizer import Tokenizer
+from thorndike.language.win_rate import Comparison, compare_with_base
+from thorndike.settings import AtLeast, MoreThan, check
+from thorndike.training.run_directory import write_json
+
+LEARNERS = ("ppo", "grpo", "rloo", "dpo", "ppo_without_kl")
+PROMPT_LENGTH = 8
+
+
+@dataclass(frozen=True)
+class Config:
+    """How large the demo is."""
+
+    total_steps: Annotated[int, AtLeast(1)] = 70  # iterations of PPO, GRPO and RLOO
+    episodes: Annotated[int, AtLeast(8)] = 128  # texts of an iteration
+    max_new_tokens: Annotated[int, AtLeast(2)] = 24  # tokens of a completion
+    learning_rate: Annotated[float, MoreThan(0)] = 3e-4  # of the policies, falling to 0
+    target_kl: Annotated[float, MoreThan(0)] = 6.0  # nats a text
+    reward_epochs: Annotated[int, AtLeast(1)] = 4  # passes over the ratings
+    reward_members: Annotated[int, AtLeast(1)] = 2  # reward models whose mean is the reward
+    pairs: Annotated[int, AtLeast(1)] = 3000  # of texts that the crowd judges
+    held_out: Annotated[int, AtLeast(1)] = 512  # prompts that policy and base are compared on
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+class Data(NamedTuple):
+    """What the demo is made of."""
+
+    base: LanguageModel
+    train: Prompts
+    held_out: Prompts
+    rated: Sequence[Rated]
+    gold: Lexicon
+
+
+Tell = Callable[[str], None]
+
+
+def review_prompts(texts: Sequence[str], tokenizer: Tokenizer, held_out: int) -> tuple[Prompts, Prompts]:
+    """The first tokens of windows of reviews that the base has not read; those for the comparison are of other reviews.
+
+    Raises ``UserError`` where there are too few.
+    """
+    found: dict[tuple[int, ...], int] = {}
+    for review, tokens in enumerate(tokenizer.encode_many(texts)):
+        for start in range(0, len(tokens) - PROMPT_LENGTH + 1, 3 * PROMPT_LENGTH):
+            found.setdefault(tuple(tokens[start : start + PROMPT_LENGTH]), review)
+    order = sorted(found, key=lambda window: found[window])
+    if len(order) <= held_out:
+        raise UserError(f"the held-out reviews give {len(order)} prompts; the demo needs more than {held_out}")
+    parts = order[:-held_out], order[-held_out:]
+    return (_as_prompts(parts[0], tokenizer), _as_prompts(parts[1], tokenizer))
+
+
+def run_demo(out: Path, data: Data, config: Config, learners: Sequence[str], seed: int, tell: Tell) -> dict[str, object]:
+    """All stages; what was found, as ``report.json`` holds it."""
+    open_run(out, {"verb": "demo", "seed": seed, "learners": list(learners), "settings": vars(config)})
+    began = time.perf_counter()
+    found: dict[str, object] = {"seed": seed}
+    kept = Kept(out, tell)
+    found["labels"] = kept.stage("labels", lambda: _labels(data, config, seed)[1])
+    model = _reward(out, data, config, seed, tell)
+    held_out = model.held_out
+    found["reward"] = None if held_out is None else held_out._asdict() | {"near_chance": held_out.near_chance}
+    refuse_if_near_chance(model)
+    found["best_of_n"] = kept.stage("best_of_n", lambda: _best_of_n(data, model, config, seed))
+    for learner in learners:
+        found[learner] = kept.stage(learner, partial(_policy, out, data, model, config, learner, seed, tell))
+    found["wall_s"] = time.perf_counter() - began
+    write_json(out / "report.json", found)
+    return found
+
+
+class Kept:
+    """Stages that are done, as files of a run."""
+
+    def __init__(self, out: Path, tell: Tell) -> None:
+        """``tell`` is called with a line a stage."""
+        self._folder, self._tell = out / "stages", tell
+        self._folder.mkdir(parents=True, exist_ok=True)
+
+    def stage(self, name: str, make: Callable[[], Mapping[str, object]]) -> dict[str, object]:
+        """What a stage found, made now unless it was made before."""
+        path = self._folder / f"{name}.json"
+        if not path.exists():
+            began = time.perf_counter()
+            write_json(path, {**make(), "wall_s": time.perf_counter() - began})
+        content = json.loads(path.read_text(encoding="utf-8"))
+        self._tell(f"{name}: {_in_short(content)}")
+        return content
+
+
+def _labels(data: Data, config: Config, seed: int) -> tuple[list, dict[str, object]]:
+    """Pairs of the base's texts with what the crowd says of them, and how good that is."""
+    prompts = _some(data.train, config.pairs)
+    samples = sample_many(data.base, prompts, _nothing, 2, max_new_tokens=config.max_new_tokens, seed=seed, batch_size=64)
+    utilities = data.gold.score([], samples.written.completions, []).reshape(-1, 2)
+    labels = judge_pairs(utilities, seed)
+    return as_comparisons(samples.written, labels), labels.quality._asdict()
+
+
+def _reward(out: Path, data: Data, config: Config, seed: int, tell: Tell) -> RewardModel:
+    folder = out / "reward"
+    if not folder.exists():
+        prompts = _some(data.train, 256)
+        samples = sample_many(data.base, prompts, _nothing, 2, max_new_tokens=config.max_new_tokens, seed=seed + 1, batch_size=64)
+        model = learn_from_ratings(
+            data.base, data.rated, samples.written, epochs=config.reward_epochs, members=config.reward_members, seed=seed,
+            log=lambda step, metrics: tell(f"reward model, step {step}: loss {metrics['train/loss'][0]:.3f}") if step % 20 == 0 else None,
+        )  # fmt: skip
+        save_reward_model(model, folder)
+    model = load_reward_model(folder)
+    if model.held_out is not None:
+        tell(f"reward: {model.held_out.accuracy:.3f} of held-out pairs, calibration error {model.held_out.calibration_error:.3f}")
+    return model
+
+
+def _best_of_n(data: Data, model: RewardModel, config: Config, seed: int) -> dict[str, object]:
+    score, _ = rewards_of(model, data.base, PROMPT_LENGTH)
+    prompts = _some(data.held_out, 64)
+    samples = sample_many(data.base, prompts, score, 64, max_new_tokens=config.max_new_tokens, seed=seed + 2, batch_size=4)
+    gold = data.gold.score([], samples.written.completions, []).reshape(-1, 64)
+    return {"points": [each._asdict() for each in curve(samples, (1, 2, 4, 8, 16, 32, 64), gold)]}
+
+
+def _policy(out: Path, data: Data, model: RewardModel, config: Config, name: str, seed: int, tell: Tell) -> dict[str, object]:
+    """Train by one learner, and compare what came of it with the base."""
+    score, _ = rewards_of(model, data.base, PROMPT_LENGTH)
+    told: dict[str, object]
+    if name == "dpo":
+        params, told = _by_dpo(data, config, seed), {}
+    else:
+        params, told = _by_rewards(out / name, data, model, config, name, seed, tell)
+    found = compare_with_base(
+        data.base, params, data.held_out, {"proxy": score, "gold": data.gold.score}, max_new_tokens=config.max_new_tokens, seed=seed + 3
+    )
+    folder = out / name / MODEL
+    if not folder.exists():
+        save_model(data.base._replace(params=params), folder)
+    return told | _comparison(found)
+
+
+def _by_rewards(
+    run: Path, data: Data, model: RewardModel, config: Config, name: str, seed: int, tell: Tell
+) -> tuple[Params, dict[str, object]]:
+    score, members = rewards_of(model, data.base, PROMPT_LENGTH)
+    base, limits = data.base, Limits(max_kl=20.0)
+    if name.startswith("ppo"):
+        free = name == "ppo_without_kl"
+        limits = Limits(None, None, None, None) if free else limits
+        value = {**model.members[0], "score": {"kernel": model.members[0]["score"]["kernel"] / model.deviation}}
+        of_ppo = _ppo_settings(config, free)
+        settings: proximal.Config | groups.Config = of_ppo
+        learner = proximal.ppo(of_ppo, base.config, base.params, value)
+    else:
+        of_groups = _group_settings(config, "group" if name == "grpo" else "leave_one_out")
+        settings, learner = of_groups, groups.grpo(of_groups, base.config, base.params)
+    open_run(run, {"verb": name, "seed": seed, "settings": vars(settings)})
+    seen: list[dict[str, float]] = []
+
+    def follow(step: int, values: dict[str, float]) -> None:
+        seen.append({"step": step} | {name: values[f"objective/{name}"] for name in ("score", "gold", "kl")})
+        if step % 10 == 0:
+            tell(f"{name}, step {step}: proxy {values['objective/score']:.2f}, gold {values['objective/gold']:.2f}, "
+                 f"{values['objective/kl']:.1f} nats")  # fmt: skip
+
+    task = Task(base, data.train, score, members if len(model.members) > 1 else None, {"gold": data.gold.score})
+    outcome = train_policy(task, learner, settings, run, seed=seed, limits=limits, told=follow)
+    return outcome.params, {"iterations": outcome.iterations, "stopped": outcome.stopped, "kl_in_training": outcome.kl, "curve": seen}
+
+
+def _ppo_settings(config: Config, free: bool) -> proximal.Config:
+    """``free``: without any penalty for leaving the base, and with a rate that does not fall."""
+    return proximal.Config(
+        total_steps=config.total_steps,
+        episodes=config.episodes,
+        batch_size=config.episodes // 2,
+        n_epochs=2,
+        max_prompt_length=PROMPT_LENGTH,
+        max_new_tokens=config.max_new_tokens,
+        learning_rate=config.learning_rate if free else f"linear({config.learning_rate}, 0)",
+        kl_coefficient=0.0 if free else 0.15,
+        target_kl=None if free else config.target_kl,
+    )
+
+
+def _group_settings(config: Config, baseline: str) -> groups.Config:
+    return groups.Config(
+        total_steps=config.total_steps,
+        episodes=config.episodes,
+        group=4,
+        baseline=baseline,
+        batch_size=config.episodes // 2,
+        n_epochs=2,
+        max_prompt_length=PROMPT_LENGTH,
+        max_new_tokens=config.max_new_tokens,
+        learning_rate=f"linear({config.learning_rate}, 0)",
+        kl_coefficient=0.15,
+        kl_in="reward",
+        target_kl=config.target_kl,
+    )
+
+
+def _by_dpo(data: Data, config: Config, seed: int) -> Params:
+    comparisons, _ = _labels(data, config, seed)
+    pairs = comparison_data(comparisons, data.base.tokenizer.pad_id, PROMPT_LENGTH + config.max_new_tokens)
+    reference = direct.reference_log_probs(data.base.params, data.base.config, pairs, 64)
+    size = min(64, len(comparisons))
+    steps = max(1, len(comparisons) // size)
+    settings = direct.Config(total_steps=steps, batch_size=size, learning_rate="linear(1e-4, 0)", beta=0.05)
+    learner = direct.dpo(settings, data.base.config)
+    state: State = learner.init(data.base.params, jax.random.key(seed))
+    update, order = jax.jit(learner.update, donate_argnums=0), np.random.default_rng(seed).permutation(len(comparisons))
+    for step in range(steps):
+        rows = order[step * size : (step + 1) * size]
+        state, _ = update(state, (), direct.Batch(pairs.rows(rows), jnp.asarray(reference[rows])))
+    return learner.params(state, data.base.params)
+
+
+def _comparison(found: Comparison) -> dict[str, object]:
+    return found._asdict() | {"judged": {name: each._asdict() for name, each in found.judged.items()}, "samples": list(found.samples)}
+
+
+def _in_short(content: Mapping[str, object]) -> str:
+    judged = content.get("judged")
+    if isinstance(judged, dict):
+        gold = judged["gold"]
+        low, high = gold["win_rate_ci95"]
+        return (
+            f"wins {gold['win_rate']:.1%} [{low:.1%}, {high:.1%}] against the base at {content['kl']:.1f} nats; gold {gold['base']:.2f} -> "
+            f"{gold['policy']:.2f}; repetition {content['repetition']:.2f}"
+        )
+    points = content.get("points")
+    if isinstance(points, list):
+        return ", ".join(f"best of {each['n']}: {each['gold']:.2f}" for each in points)
+    return ", ".join(f"{name} {value:.3f}" for name, value in content.items() if isinstance(value, float))
+
+
+def _nothing(prompts: Sequence[str], completions: Sequence[str], ids: Sequence[Sequence[int]]) -> list[float]:
+    """Nobody asks for the best."""
+    return [0.0] * len(prompts)
+
+
+def _some(prompts: Prompts, most: int) -> Prompts:
+    return Prompts(prompts.tokens[:most], prompts.segments[:most], prompts.texts[:most])
+
+
+def _as_prompts(windows: Sequence[tuple[int, ...]], tokenizer: Tokenizer) -> Prompts:
+    tokens = np.array(windows, np.int32)
+    return Prompts(tokens, np.ones_like(tokens), tuple(tokenizer.decode(window) for window in windows))
