@@ -56,20 +56,20 @@ def test_an_implicit_prompt_is_what_both_answers_begin_with():
 
 GOOD_ROW = EXAMPLES["preference", False]
 WRONG = {
-    "no JSON": ('{"prompt": ', "row 2 is damaged"),
-    "no object": ("[1, 2]", "row 2 is .* must be an object"),
+    "no JSON": ('{"prompt": ', "row 2: no JSON"),
+    "no object": ("[1, 2]", "row 2: expected an object"),
     "an unknown column": ('{"question": "a"}', "row 2 has the columns 'question'"),
     "an answer missing": ('{"prompt": "a", "chosen": null, "rejected": "b"}', "row 2"),
     "an empty answer": ('{"prompt": "a", "chosen": " ", "rejected": "b"}', "row 2: 'chosen' is empty"),
     "a number for an answer": ('{"prompt": "a", "chosen": 3, "rejected": "b"}', "row 2: 'chosen' is 3"),
     "answers that are the same": ('{"prompt": "a", "chosen": "b", "rejected": "b"}', "row 2: .* the same"),
-    "a name twice": ('{"prompt": "a", "prompt": "b", "chosen": "c", "rejected": "d"}', "row 2 .* twice"),
-    "half a character": ('{"prompt": "a", "chosen": "\\ud83d", "rejected": "d"}', "row 2 .* Unicode"),
-    "no number": ('{"prompt": "a", "chosen": "c", "rejected": "d", "weight": NaN}', "row 2 .* NaN"),
+    "a name twice": ('{"prompt": "a", "prompt": "b", "chosen": "c", "rejected": "d"}', "row 2: .* twice"),
+    "half a character": ('{"prompt": "a", "chosen": "\\ud83d", "rejected": "d"}', "row 2 holds half a character"),
+    "no number": ('{"prompt": "a", "chosen": "c", "rejected": "d", "weight": NaN}', "row 2: .* NaN"),
     "mixed forms": ('{"prompt": "a", "chosen": [{"role": "user", "content": "x"}], "rejected": "d"}', "row 2 mixes forms"),
     "a wrong message": ('{"prompt": "a", "chosen": [{"role": "user"}], "rejected": "d"}', "row 2: 'chosen', message 1"),
     "another format": ('{"prompt": "a", "completion": "b"}', "row 2 is standard prompt completion, but the rows before are standard pref"),
-    "deep nesting": ('{"prompt": ' + "[" * 100_000, "row 2 is nested too deeply"),
+    "deep nesting": ('{"prompt": ' + "[" * 100_000, "row 2: nested too deeply"),
 }
 
 
@@ -85,14 +85,14 @@ def test_what_is_wrong_is_named_by_file_and_row(name, tmp_path):
 @pytest.mark.parametrize(
     ("name", "content", "why"),
     [
-        ("x.jsonl", b'{"text": "a"}\n{"text": "\xff"}', "row 2 is not UTF-8"),
-        ("x.csv", b"text,n\na,1\n\xff,2\n", "line 3 is not UTF-8"),
-        ("x.csv", b"text,n\na,1\nb\n", "row 2 has 1 cells"),
+        ("x.jsonl", b'{"text": "a"}\n{"text": "\xff"}', "row 2: not UTF-8"),
+        ("x.csv", b"text,n\na,1\n\xff,2\n", "row 3: not UTF-8"),
+        ("x.csv", b"text,n\na,1\nb\n", "row 2: it has not as many cells"),
         ("x.csv", b"text,text\na,1\n", "names a column twice"),
-        ("x.csv", b'text,n\n"a,1\n', "row 1 is damaged"),
+        ("x.csv", b'text,n\n"a,1\n', "row 1: "),
         ("x.csv", b"prompt,completion,label\na,b,perhaps\n", "'label' is 'perhaps'"),
-        ("x.json", b'{"text": "a"}', "must hold a list"),
-        ("x.jsonl", b"\n\n", "holds no rows"),
+        ("x.json", b'{"text": "a"}', "expected a list"),
+        ("x.jsonl", b"\n\n", "no rows"),
         ("x.txt", b"a", "ends in"),
     ],
 )

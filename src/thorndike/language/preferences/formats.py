@@ -9,8 +9,9 @@ from thorndike.language.preferences.assignment import Plan, with_raters
 from thorndike.language.preferences.comparisons import compared
 from thorndike.language.preferences.judgements import Candidate, Content, Judged, NewItem
 from thorndike.language.preferences.noise import Method, believe
-from thorndike.language.preferences.records import Records, Row, with_explicit_prompt
+from thorndike.language.preferences.records import Records, with_explicit_prompt
 from thorndike.language.preferences.store import Store
+from thorndike.training.json_files import Json
 
 EXPORTS = ("preference", "implicit", "unpaired", "prompt_only", "prompt_completion", "judgements")
 TIES = ("drop", "half")
@@ -37,7 +38,7 @@ def import_records(store: Store, project: int, records: Records, rater: str, pla
             return Imported(store.add_items(project, items), 0)
         return Imported(*store.add_judged(project, store.rater(rater), [(item, [0, 1]) for item in items]))
     if records.format in ("candidates", "completions"):
-        found = [_item(row, records.format, place) for row, place in zip(records.rows, records.places(), strict=True)]
+        found = [_item(row, records.format, place) for row, place in zip(records.rows, records.places, strict=True)]
     elif records.format in ("prompt_completion", "unpaired_preference"):
         found = list(_together(records))
     else:
@@ -47,7 +48,7 @@ def import_records(store: Store, project: int, records: Records, rater: str, pla
     return Imported(store.add_items(project, with_raters(items, plan)), 0, len(found) - len(items))
 
 
-def export_rows(store: Store, project: int, what: str = "preference", method: Method = "dawid_skene", ties: str = "drop") -> list[Row]:
+def export_rows(store: Store, project: int, what: str = "preference", method: Method = "dawid_skene", ties: str = "drop") -> list[Json]:
     """Rows of one of ``EXPORTS``. ``ties``: left out, or ``half``: two rows, one each way, of half the weight."""
     if what not in EXPORTS:
         raise UserError(f"there is no export called '{what}'; there are {', '.join(EXPORTS)}")
@@ -97,7 +98,7 @@ def _item(row: Mapping[str, object], column: str, place: str) -> NewItem:
 def _together(records: Records) -> Iterator[NewItem]:
     """One item a prompt."""
     found: dict[str, tuple[Content, list[Candidate], list[str]]] = {}
-    for row, place in zip(records.rows, records.places(), strict=True):
+    for row, place in zip(records.rows, records.places, strict=True):
         _, candidates, places = found.setdefault(repr(row["prompt"]), (_content(row["prompt"]), [], []))
         details = {name: value for name, value in row.items() if name not in ("prompt", "completion")}
         _add_if_new(candidates, Candidate(_content(row["completion"]), str(row.get("model", "")), details))
@@ -133,7 +134,7 @@ def _answer(prompt: Content, candidate: Content) -> object:
 
 def _pairs(
     judged: Sequence[Judged], prompts: Mapping[int, Content], candidates: Mapping[int, Candidate], method: Method, ties: str
-) -> Iterator[Row]:
+) -> Iterator[Json]:
     comparisons = compared(judged)
     believed = believe(comparisons, method).first_is_better
     votes: dict[int, list[tuple[str, float, float]]] = defaultdict(list)
@@ -165,7 +166,7 @@ def _pairs(
             }
 
 
-def _implicit(row: Row) -> Row:
+def _implicit(row: Json) -> Json:
     prompt, chosen, rejected = row["prompt"], row["chosen"], row["rejected"]
     rest = {name: value for name, value in row.items() if name not in ("prompt", "chosen", "rejected")}
     if isinstance(prompt, str) and isinstance(chosen, str) and isinstance(rejected, str):
@@ -176,8 +177,8 @@ def _implicit(row: Row) -> Row:
 
 
 def _unpaired(
-    judged: Sequence[Judged], prompts: Mapping[int, Content], candidates: Mapping[int, Candidate], pairs: Sequence[Row]
-) -> Iterator[Row]:
+    judged: Sequence[Judged], prompts: Mapping[int, Content], candidates: Mapping[int, Candidate], pairs: Sequence[Json]
+) -> Iterator[Json]:
     """Good: who was preferred; bad: who was not, and those of which a rater said that both are bad."""
     for row in pairs:
         if not row["tie"]:
@@ -197,9 +198,9 @@ def _unpaired(
                 }
 
 
-def _best(pairs: Sequence[Row]) -> Iterator[Row]:
+def _best(pairs: Sequence[Json]) -> Iterator[Json]:
     """Of every prompt, the completion that won most: what to fine-tune on."""
-    won: dict[object, dict[str, tuple[float, Row]]] = defaultdict(dict)
+    won: dict[object, dict[str, tuple[float, Json]]] = defaultdict(dict)
     for row in pairs:
         for side, score in (("chosen", row["p_chosen"]), ("rejected", 0.0)):
             assert isinstance(score, float)
@@ -210,7 +211,7 @@ def _best(pairs: Sequence[Row]) -> Iterator[Row]:
         yield {**best, "prompt_id": number}
 
 
-def _judgement(each: Judged, prompts: Mapping[int, Content], candidates: Mapping[int, Candidate]) -> Row:
+def _judgement(each: Judged, prompts: Mapping[int, Content], candidates: Mapping[int, Candidate]) -> Json:
     made = [candidates[number] for number in each.candidates]
     return {
         "prompt": _plain(prompts[each.prompt]),
