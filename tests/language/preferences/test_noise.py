@@ -93,7 +93,7 @@ def test_an_unknown_method_and_a_prior_that_means_ill_are_refused():
 
 def test_davidson_finds_strengths_and_ties():
     generator = np.random.default_rng(0)
-    strengths, nu, games = np.array([-1.0, 0.0, 0.3, 0.7]), 0.8, 40_000
+    strengths, nu, games = np.array([-1.0, 0.0, 0.3, 0.7]), 0.8, 10_000
     p = np.exp(strengths)
     pairs = [(i, j) for i in range(4) for j in range(i + 1, 4)]
     which = generator.integers(len(pairs), size=games)
@@ -104,8 +104,8 @@ def test_davidson_finds_strengths_and_ties():
     value = np.where(u < p[first] / total, 1.0, np.where(u < (p[first] + tie) / total, 0.5, 0.0))
     numbered = tuple(Pair(each, 0, *pair) for each, pair in enumerate(pairs))
     found = davidson(Comparisons(numbered, ("anna",), which, np.zeros(games, np.int64), value, np.ones(games)))
-    np.testing.assert_allclose([found.strengths[each] for each in range(4)], strengths, atol=0.05)
-    assert abs(found.tie - nu) < 0.05
+    np.testing.assert_allclose([found.strengths[each] for each in range(4)], strengths, atol=0.1)
+    assert abs(found.tie - nu) < 0.1
 
 
 def test_one_that_never_lost_is_not_infinitely_strong():
