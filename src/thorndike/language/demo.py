@@ -21,23 +21,24 @@ from thorndike.language import grpo as groups
 from thorndike.language import ppo as proximal
 from thorndike.language.best_of_n import curve, sample_many
 from thorndike.language.comparisons import comparison_data
+from thorndike.language.corpus import MOVIE_REVIEWS, read_corpus
 from thorndike.language.decoder import Params
 from thorndike.language.demo_labels import as_comparisons, judge_pairs
 from thorndike.language.demo_reward import learn_from_ratings, rewards_of
 from thorndike.language.learner import State
-from thorndike.language.model import LanguageModel, save_model
+from thorndike.language.model import LanguageModel, load_model, save_model
 from thorndike.language.over_optimisation import Limits
 from thorndike.language.policy_training import Task, train_policy
+from thorndike.language.pretraining import base_model
 from thorndike.language.reward_files import RewardModel, load_reward_model, refuse_if_near_chance, save_reward_model
 from thorndike.language.rollouts import Prompts
-from thorndike.language.sentiment import Lexicon, Rated
+from thorndike.language.sentiment import Lexicon, Rated, have_reviews, read_lexicon, read_ratings
 from thorndike.language.text_run import MODEL, open_run
 from thorndike.language.tokenizer import Tokenizer
 from thorndike.language.win_rate import Comparison, compare_with_base
-from thorndike.settings import AtLeast, MoreThan, check
+from thorndike.settings import AtLeast, MoreThan, check, settings_of
 from thorndike.training.run_directory import write_json
 
-LEARNERS = ("ppo", "grpo", "rloo", "dpo", "ppo_without_kl")
 PROMPT_LENGTH = 8
 
 
@@ -88,9 +89,21 @@ def review_prompts(texts: Sequence[str], tokenizer: Tokenizer, held_out: int) ->
     return (_as_prompts(parts[0], tokenizer), _as_prompts(parts[1], tokenizer))
 
 
+def demo(out: Path, base: Path | None, config: Config, learners: Sequence[str], seed: int, tell: Tell) -> dict[str, object]:
+    """Everything, from data that is fetched where it is missing, and a base that is made where none is given."""
+    have_reviews()
+    corpus = read_corpus(MOVIE_REVIEWS)
+    if base is None:
+        tell("the base model is made of film reviews, once")
+        base = base_model()
+    model = load_model(base)
+    train, held_out = review_prompts(corpus.held_out, model.tokenizer, config.held_out)
+    return run_demo(out, Data(model, train, held_out, read_ratings(), read_lexicon()), config, learners, seed, tell)
+
+
 def run_demo(out: Path, data: Data, config: Config, learners: Sequence[str], seed: int, tell: Tell) -> dict[str, object]:
     """All stages; what was found, as ``report.json`` holds it."""
-    open_run(out, {"verb": "demo", "seed": seed, "learners": list(learners), "settings": vars(config)})
+    open_run(out, {"verb": "demo", "seed": seed, "learners": list(learners), "settings": settings_of(config)})
     began = time.perf_counter()
     found: dict[str, object] = {"seed": seed}
     kept = Kept(out, tell)
@@ -191,7 +204,7 @@ def _by_rewards(
     else:
         of_groups = _group_settings(config, "group" if name == "grpo" else "leave_one_out")
         settings, learner = of_groups, groups.grpo(of_groups, base.config, base.params)
-    open_run(run, {"verb": name, "seed": seed, "settings": vars(settings)})
+    open_run(run, {"verb": name, "seed": seed, "settings": settings_of(settings)})
     seen: list[dict[str, float]] = []
 
     def follow(step: int, values: dict[str, float]) -> None:

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from thorndike.errors import UserError
-from thorndike.language.corpus import read_corpus
+from thorndike.language.corpus import MOVIE_REVIEWS, read_corpus
 from thorndike.language.data import TokenRow
 from thorndike.language.decoder import initial_params
 from thorndike.language.learner import State
@@ -66,10 +66,7 @@ def pretrain(source: str, out: Path, config: Config, seed: int = 0, progress: bo
     rows, held_out = (
         concatenated(as_rows(texts, tokenizer), config.max_length, tokenizer.pad_id) for texts in (corpus.train, corpus.held_out)
     )
-    shared = {
-        name: settings[name] for name in ("total_steps", "batch_size", "max_length", "learning_rate", "warmup_fraction", "weight_decay")
-    }
-    learner = sft(SftConfig(**shared), model_config)
+    learner = sft(_learning(config), model_config)
     score = jax.jit(learner.evaluate)
 
     def evaluate(state: State) -> Mapping[str, float]:
@@ -93,6 +90,17 @@ def base_model(corpus: str = MOVIE_REVIEWS, config: Config = DEFAULT, seed: int 
     if not (run / MODEL / "config.json").exists() and pretrain(corpus, run, config, seed, progress).status != "finished":
         raise UserError(f"making the base model was interrupted; the same command goes on from where it stopped ({run})")
     return run / MODEL
+
+
+def _learning(config: Config) -> SftConfig:
+    return SftConfig(
+        total_steps=config.total_steps,
+        learning_rate=config.learning_rate,
+        warmup_fraction=config.warmup_fraction,
+        batch_size=config.batch_size,
+        max_length=config.max_length,
+        weight_decay=config.weight_decay,
+    )
 
 
 def train_tokenizer(texts: Sequence[str], vocab_size: int) -> Tokenizer:

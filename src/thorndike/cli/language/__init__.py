@@ -13,6 +13,13 @@ LANGUAGE_VERBS = {
     "chat": "talk with a model in the terminal",
     "pretrain": "a small model from nothing: its tokenizer and its parameters from plain text",
     "sft": "fine-tune a model on texts, prompts with completions, or conversations",
+    "reward": "a reward model from preferences, and how far it can be trusted",
+    "ppo": "PPO towards a reward, held close to the base",
+    "grpo": "GRPO: several completions of a prompt as each other's baseline",
+    "rloo": "REINFORCE, the other completions of a prompt as the baseline",
+    "dpo": "a policy from preferences, without a reward model",
+    "eval": "a policy beside its base: win rate, divergence, drift",
+    "demo": "all of it on a small model, with a report",
 }
 """Verb -> its line in the help; each is a file beside this one."""
 
