@@ -13,8 +13,8 @@ import pytest
 
 from language.make_reference import REFERENCE
 from thorndike.errors import UserError
-from thorndike.language import sentiment
-from thorndike.language.best_of_n import Samples, best, chances, curve, sample_many
+from thorndike.language import best_of_n, sentiment
+from thorndike.language.best_of_n import Samples, best, chances, sample_many
 from thorndike.language.demo_labels import as_comparisons, judge_pairs
 from thorndike.language.demo_report import write_report
 from thorndike.language.model import LanguageModel, load_decoder
@@ -114,7 +114,7 @@ def test_best_of_fewer_is_the_mean_over_all_choices() -> None:
     generator = np.random.default_rng(0)
     proxy, gold = generator.normal(size=(2, 3, 6))
     samples = Samples(Written([], [], [], np.zeros(0, int), np.zeros(0, bool)), proxy)
-    for point in curve(samples, (1, 2, 4, 6), gold):
+    for point in best_of_n.curve(samples, (1, 2, 4, 6), gold):
         wanted = [
             max(choice, key=lambda place, row=row: proxy[row, place])
             for row in range(3)
@@ -156,11 +156,12 @@ def test_the_report_needs_nothing_else(tmp_path: Path) -> None:
     judged = {"win_rate": 0.7, "win_rate_ci95": [0.6, 0.8], "policy": 0.9, "base": 0.1}
     sample = {"prompt": "The <b>", "base": "x & y", "policy": "<script>alert(1)</script>"}
     part = {"kl": 6.0, "judged": {"gold": judged, "proxy": judged}, "repetition": 0.1, "samples": [sample], "stopped": "far <away>"}
+    curve = [{"step": step, "score": score, "gold": 0.1, "kl": score} for step, score in ((1, 0.0), (2, 1.0))]
     found = {
         "seed": 1, "labels": {"single": 0.66, "majority": 0.75, "dawid_skene": 0.83, "reliability": {"fair-1": 0.8}},
         "reward": {"accuracy": 0.69, "accuracy_ci95": [0.66, 0.72], "pairs": 700, "calibration_error": 0.04},
         "best_of_n": {"points": [{"n": 1, "kl": 0.0, "gold": 0.1}, {"n": 4, "kl": 0.6, "gold": 0.2}]},
-        "ppo": part | {"curve": [{"step": 1, "score": 0.0, "gold": 0.1, "kl": 0.0}, {"step": 2, "score": 1.0, "gold": 0.4, "kl": 3.0}]}, "dpo": part,
+        "ppo": part | {"curve": curve}, "dpo": part,
     }  # fmt: skip
     files = write_report(tmp_path, json.loads(json.dumps(found)))
     page = files.page.read_text()

@@ -51,7 +51,7 @@ class Config:
     max_new_tokens: Annotated[int, AtLeast(2)] = 24  # tokens of a completion
     learning_rate: Annotated[float, MoreThan(0)] = 3e-4  # of the policies, falling to 0
     target_kl: Annotated[float, MoreThan(0)] = 6.0  # nats a text
-    reward_epochs: Annotated[int, AtLeast(1)] = 4  # passes over the ratings
+    reward_epochs: Annotated[int, AtLeast(1)] = 2  # passes over the ratings
     reward_members: Annotated[int, AtLeast(1)] = 2  # reward models whose mean is the reward
     pairs: Annotated[int, AtLeast(1)] = 3000  # of texts that the crowd judges
     held_out: Annotated[int, AtLeast(1)] = 512  # prompts that policy and base are compared on
