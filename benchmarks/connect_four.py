@@ -212,7 +212,7 @@ class OpenSpiel:
 
 def measure(run: Path, python: Path, simulations: int, games: int, rollouts: int) -> dict[str, object]:
     record = json.loads((run / "run.json").read_text(encoding="utf-8")) if (run / "run.json").exists() else {}
-    row: dict[str, object] = {name: record.get(name) for name in ("steps_done", "cpu_s", "wall_s", "compile_s", "command")}
+    row: dict[str, object] = {name: record.get(name) for name in ("steps_done", "cpu_s", "wall_s", "compile_s")}
     row["network_errors"] = errors(agent(run, 0, EACH))
     print("network alone:", row["network_errors"], flush=True)
     began = time.process_time()

@@ -43,6 +43,8 @@ FLAGS = {
     "reproduce": ["--steps"],
     "compare": ["--episodes"],
     "check-env": ["--steps", "--seed", "--max-episode-steps"],
+    "arena": ["--games", "--seed"],
+    "play": ["--seed"],
 }
 """Flags that take a whole number."""
 OTHER_FLAGS = [
@@ -61,6 +63,7 @@ OTHER_FLAGS = [
     "version",
     "metric",
 ]
+OTHER_FLAGS += ["games", "simulations", "opening-plies", "save", "second"]
 OTHER_FLAGS += ["against", "failed-below", "plot", "file", "title", "video", "window", "stochastic", "eval-episodes", "n-timesteps"]
 OTHER_FLAGS += [
     "total-steps",
@@ -309,6 +312,8 @@ def sound(chance: random.Random, verb: str) -> list[str]:
         return [verb, "no-run"]
     if verb == "ope":
         return [verb, "no-run", "--data", "empty"]
+    if verb in ("arena", "play"):
+        return [verb, "connect_four", *(["random", "random"] if verb == "arena" else [])]
     return {"check-env": [verb, chance.choice(IDS)], "list": [verb, "algorithms"], "info": [verb]}.get(verb, [verb])
 
 

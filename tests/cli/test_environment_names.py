@@ -8,6 +8,7 @@ from thorndike.cli.environment_names import check_environment
 from thorndike.environments.host.envpool_ids import pool_ids
 from thorndike.environments.native import NATIVE
 from thorndike.errors import UserError
+from thorndike.games.registry import game_ids
 
 
 def check(name):
@@ -19,10 +20,19 @@ def test_the_ids_read_from_text_are_those_gymnasium_registers():
     own = {id for id, spec in gymnasium.registry.items() if spec.namespace is None and str(spec.entry_point).startswith("gymnasium.")}
     known = environment_names._ids_in_the_text()
     assert own <= known
-    assert known - own <= set(NATIVE) | pool_ids()
+    assert known - own <= set(NATIVE) | set(game_ids()) | pool_ids()
 
 
-@pytest.mark.parametrize(("name", "close"), [("CartPol-v1", "CartPole-v1"), ("Taxi-v33", "Taxi-v3"), ("halfcheetah-v5", "HalfCheetah-v5")])
+def test_alphazero_is_for_games():
+    with pytest.raises(UserError, match="learns games of two players, such as connect_four, and CartPole-v1 is none"):
+        check_environment("CartPole-v1", engine="auto", env_kwargs={}, max_episode_steps=None, algorithm="alphazero")
+    check_environment("connect_four", engine="auto", env_kwargs={}, max_episode_steps=None, algorithm="alphazero")
+
+
+@pytest.mark.parametrize(
+    ("name", "close"),
+    [("conect_four", "connect_four"), ("CartPol-v1", "CartPole-v1"), ("Taxi-v33", "Taxi-v3"), ("halfcheetah-v5", "HalfCheetah-v5")],
+)
 def test_a_misspelt_id_gets_the_nearest_one(name, close):
     with pytest.raises(UserError, match=f"unknown environment '{name}'; did you mean '{close}'"):
         check(name)

@@ -101,7 +101,7 @@ def test_commands_and_mistakes_while_playing(monkeypatch, capsys):
     assert len(told["moves"]) == 2
     lines = [line.split("> ")[-1] for line in err.splitlines()]
     assert "a3 b3 c3 a2 b2 c2 a1 b1 c1" in lines
-    assert "b2 is no legal move; `moves` lists those that are, `help` the commands" in lines or any("did you mean" in line for line in lines)
+    assert any(line.startswith("b2 is no legal move; ") for line in lines)
     assert "there is no move of yours to take back" in lines
     assert any(line.startswith("mcts:simulations=16 would play") and "expects" in line for line in lines)
     assert "hnt is no legal move; did you mean hint?" in lines
@@ -197,7 +197,7 @@ def test_the_public_api_plays(place):
 
 @pytest.mark.slow
 def test_a_trained_run_plays(place, capsys):
-    run = td.train("alphazero", "tic_tac_toe", total_steps=512, num_envs=8, learning_starts=64, batch_size=32).run
+    run = td.train("alphazero", "tic_tac_toe", steps=512, num_envs=8, settings={"learning_starts": 64, "batch_size": 32}).run
     assert main(["arena", "tic_tac_toe", "latest", "random", "--games", "4", "--simulations", "8", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["players"][0]["player"] == run.name

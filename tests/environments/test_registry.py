@@ -15,6 +15,7 @@ from thorndike.environments.native import NATIVE, factory
 from thorndike.environments.native.vectorize import vectorize
 from thorndike.environments.registry import build_host, build_native, environment_ids, reference, resolve
 from thorndike.errors import UserError
+from thorndike.games.registry import game_ids
 
 FILE = Path(__file__).parent / "counting_environments.py"
 needs_pool = pytest.mark.skipif(not pool_is_installed(), reason="EnvPool is not installed")
@@ -208,7 +209,7 @@ def test_a_shared_id_of_the_pool_shows_gymnasiums_spaces_and_limit():
 
 def test_every_listed_id_resolves_to_its_engine():
     listed = environment_ids()
-    assert listed["native"] == sorted(NATIVE)
+    assert listed["native"] == sorted({*NATIVE, *game_ids()})
     assert "FrozenLake-v1" in listed["gymnasium"]
     assert not set(listed["native"]) & set(listed["gymnasium"])
     for engine in ("native", "envpool"):

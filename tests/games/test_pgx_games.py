@@ -8,6 +8,7 @@ import pytest
 from games.rules import KEY, Compiled, SlowGo, SlowHex, SlowOthello
 from thorndike.errors import UserError
 from thorndike.games import pgx_games
+from thorndike.games.environment import game_environment
 from thorndike.games.game import named_action
 from thorndike.games.registry import ADAPTED_GAMES, game
 
@@ -171,3 +172,9 @@ def test_the_version_and_its_absence_are_told_in_one_line(monkeypatch):
 
 def test_every_adapted_game_has_a_face_and_a_length():
     assert set(ADAPTED_GAMES) == set(pgx_games.FACES) == set(pgx_games.LONGEST)
+
+
+@pytest.mark.slow
+def test_self_play_begins_games_with_dice_at_their_beginning(quick_compile):
+    positions, _ = game_environment(game("backgammon"), 4).init(KEY)
+    assert positions._step_count.tolist() == [0] * 4

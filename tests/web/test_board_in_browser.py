@@ -8,6 +8,9 @@ import pytest
 pytest.importorskip("nicegui")
 from playwright.sync_api import Page, expect
 
+# The machine may be busy with other tests.
+expect.set_options(timeout=20_000)
+
 
 def start(page: Page, studio, game="tic_tac_toe", opponent=None, strength=None, begins=None) -> Page:
     page.goto(f"{studio.root}/new/{game}")
@@ -43,6 +46,8 @@ def tab_to(page: Page, selector: str) -> None:
 def test_a_game_of_tic_tac_toe_by_clicks(page, studio):
     start(page, studio, opponent="first")
     expect(status(page)).to_have_text("Your turn: you are X")
+    shown = [each for each in page.get_by_role("group", name="Game", exact=True).get_by_role("button").all_inner_texts() if each]
+    assert shown == ["Take back", "Swap sides", "New game", "Save"]
     # The opponent takes a3, then b3, and is too late.
     for number, (row, column) in enumerate(((1, 1), (0, 2), (2, 0))):
         square(page, row, column).click()

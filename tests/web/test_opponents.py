@@ -27,18 +27,15 @@ def test_runs_of_this_game_come_first_the_newest_before_the_others(tmp_path):
     ):
         write_run(tmp_path / environment / "alphazero" / name, algorithm="alphazero", environment=environment, seeds=1)
     found = names("tic_tac_toe", tmp_path)
-    assert found[:3] == [
-        "Trained: alphazero, 20260102-000000-new",
-        "Trained: alphazero, 20260101-000000-old",
-        "Tree search, without a network",
-    ]
+    assert found[:2] == ["Trained: alphazero, 20260102-000000-new", "Trained: alphazero, 20260101-000000-old"]
+    assert found[2:4] == ["Trained: Thorndike's own", "Tree search, without a network"]
     assert found[-1] == "Random moves"
 
 
 def test_a_damaged_run_is_left_out(tmp_path):
     run = write_run(tmp_path / "a" / "20260101-000000-old", environment="tic_tac_toe", seeds=1)
     (run / "run.json").write_text("{")
-    assert names("tic_tac_toe", tmp_path)[0] == "Tree search, without a network"
+    assert names("tic_tac_toe", tmp_path)[0] == "Trained: Thorndike's own"
 
 
 def test_no_search_where_there_is_none_or_it_takes_too_long(tmp_path, monkeypatch):

@@ -34,7 +34,7 @@ from thorndike.functional.learning_dynamics import mean_square_gradient
 from thorndike.functional.policy_losses import weighted_mean
 from thorndike.functional.schedules import schedule
 from thorndike.games.game import Game, Position
-from thorndike.games.packing import packing
+from thorndike.games.packing import Packing, packing
 from thorndike.games.search import SEARCHES, Evaluate, Found, SearchSettings, search
 from thorndike.games.self_play import Batch, Manners, as_batch, draw_moves, false_resignations, fresh_memory, move, players
 from thorndike.networks.board import TOWERS, board_network, win_value
@@ -120,116 +120,129 @@ def evaluator(game: Game, network: Network) -> Evaluate:
     return evaluate
 
 
+class Parts(NamedTuple):
+    """What the functions below share."""
+
+    config: Config
+    game: Game
+    network: Network
+    whole: Packing
+    optimizer: optax.GradientTransformation
+    num_envs: int
+
+    @property
+    def rows(self) -> int:
+        """Positions of an iteration."""
+        return self.config.n_steps * self.num_envs
+
+    @property
+    def manners(self) -> Manners:
+        """How games are played."""
+        c = self.config
+        return Manners(c.temperature, c.temperature_moves, c.resign_threshold, c.resign_check_fraction, c.full_search_fraction)
+
+    def look_ahead(self, simulations: int, explore: bool, params: PyTree, obs: Observation, key: Key[Array, ""]) -> Found:
+        """A search from the positions of observations ``[B]``. Consumes the key."""
+        c, positions = self.config, jax.vmap(self.whole.unpack)(obs["position"])
+        noise, bandit = (c.dirichlet_alpha, c.dirichlet_fraction, c.c_puct), (c.considered_moves, c.value_scale, c.rescale_values)
+        settings = SearchSettings(c.search, simulations, *noise, *bandit)
+        return search(self.game, evaluator(self.game, self.network), settings, params, positions, key, explore)
+
+
+def init_state(parts: Parts, key: Key[Array, ""]) -> State:
+    """Parameters, and a window that holds a longest game beside what is written at once. Consumes the key."""
+    config, game = parts.config, parts.game
+    params = parts.network.init(key, jnp.zeros((1, *game.observation_shape)))
+    least = (config.n_steps + game.max_moves) * parts.num_envs
+    steps = math.ceil(max(config.buffer_size, least) / parts.rows) * config.n_steps
+    buffer = init_self_play(steps, parts.num_envs, parts.whole.size, game.num_actions)
+    return State(params, jax.tree.map(jnp.copy, params), parts.optimizer.init(params), buffer, jnp.zeros((), jnp.int32))
+
+
+def remember(parts: Parts, state: State, rollout: Rollout) -> State:
+    """The rollout's positions in the window, and the outcomes of the games that ended."""
+    step, extras, positions = rollout.step, rollout.extras, rollout.obs["position"]
+    nothing, movers = jnp.zeros(step.reward.shape), players(parts.game, positions)
+    new = Rows(positions, movers, extras["policy"], extras["policy_weight"], nothing, nothing > 0, extras["resigns"])
+    buffer = add_self_play(state.buffer, new, step.reward, step.done, parts.game.max_moves)
+    return state._replace(buffer=buffer, env_steps=state.env_steps + parts.rows)
+
+
+def learn(parts: Parts, state: State, key: Key[Array, ""]) -> tuple[State, Metrics]:
+    """One minibatch. Consumes the key."""
+    config = parts.config
+    sampled = sample_self_play(state.buffer, key, config.batch_size)
+    batch = as_batch(parts.game, sampled, config.symmetries)
+    (_, metrics), grads = jax.value_and_grad(alphazero_loss, has_aux=True)(state.params, batch, parts.network, config.vf_coef)
+    rate = schedule(config.learning_rate)(state.env_steps / config.total_steps)
+    direction, opt_state = parts.optimizer.update(grads, state.opt_state, state.params)
+    metrics |= {"train/grad_norm": optax.tree.norm(grads), "train/learning_rate": rate}
+    metrics["train/known_outcomes"] = jnp.mean(batch.value_weight)
+    metrics["train/resign_checks"], metrics["train/resign_errors"] = false_resignations(sampled)
+    params = jax.tree.map(lambda p, d: p - rate * d, state.params, direction)
+    average = jax.tree.map(lambda a, p: a + config.averaging * (p - a), state.average, params)
+    sound = all_finite(metrics["train/loss"], metrics["train/grad_norm"])
+    kept = accept_if(sound, (params, average, opt_state), (state.params, state.average, state.opt_state))
+    return state._replace(params=kept[0], average=kept[1], opt_state=kept[2]), metrics
+
+
+def look_at(parts: Parts, state: State) -> Metrics:
+    """Dead units, ranks and gradient norms of the network, and how old what it learns from is."""
+    key = key_to_look_by(state.env_steps)
+    seen = as_batch(parts.game, sample_self_play(state.buffer, key, parts.config.batch_size), symmetries=False)
+    age = parts.num_envs * (jnp.maximum(state.buffer.size, 1) - 1).astype(jnp.float32) / 2.0
+    return look_into(parts.network, state.params, seen.board, mean_square_gradient(state.opt_state)) | {"train/replay_age": age}
+
+
 def alphazero(config: Config, spec: EnvSpec) -> Algorithm:
     """AlphaZero for a game. Raises ``UserError`` for an environment that is no game of two players without dice."""
     game = spec.game
     if game is None or game.num_players != 2 or game.has_chance:
         raise UserError(f"alphazero plays games of two players without dice (connect_four, ...), which {spec.id} is not: train it with ppo")
-    network, whole = board_network(game.num_actions, config.tower, config.width, config.blocks), packing(game)
-    evaluate = evaluator(game, network)
-    rows, longest = config.n_steps * spec.num_envs, game.max_moves
-    ring = math.ceil(max(config.buffer_size, (config.n_steps + longest) * spec.num_envs) / rows) * config.n_steps
-    full, fast, strong = (
-        SearchSettings(
-            config.search,
-            simulations,
-            config.dirichlet_alpha,
-            config.dirichlet_fraction,
-            config.c_puct,
-            config.considered_moves,
-            config.value_scale,
-            config.rescale_values,
-        )
-        for simulations in (config.num_simulations, config.fast_simulations, max(config.eval_simulations, 1))
-    )
-    manners = Manners(
-        config.temperature,
-        config.temperature_moves,
-        config.resign_threshold,
-        config.resign_check_fraction,
-        config.full_search_fraction,
-    )
+    network = board_network(game.num_actions, config.tower, config.width, config.blocks)
     optimizer = optax.chain(
-        optax.clip_by_global_norm(config.max_grad_norm),
-        optax.scale_by_adam(),
-        optax.add_decayed_weights(config.weight_decay),
+        optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam(), optax.add_decayed_weights(config.weight_decay)
     )
-    learning_rate = schedule(config.learning_rate)
+    parts = Parts(config, game, network, packing(game), optimizer, spec.num_envs)
 
-    def init(key: Key[Array, ""]) -> State:
-        params = network.init(key, jnp.zeros((1, *game.observation_shape)))
-        buffer = init_self_play(ring, spec.num_envs, whole.size, game.num_actions)
-        return State(params, jax.tree.map(jnp.copy, params), optimizer.init(params), buffer, jnp.zeros((), jnp.int32))
-
-    def look_ahead(params: PyTree, obs: Observation, noise: Noise) -> Found:
-        positions, key = jax.vmap(whole.unpack)(obs["position"]), noise["search"].numbers
-
-        def deep() -> Found:
-            return search(game, evaluate, full, params, positions, key, explore=True)
-
-        if config.full_search_fraction == 1:
-            return deep()
-        return jax.lax.cond(noise["full"].numbers, deep, lambda: search(game, evaluate, fast, params, positions, key, explore=False))
+    def prior(params: PyTree, obs: Observation) -> Float[Array, "B actions"]:
+        return jax.nn.softmax(jnp.where(obs[MASK] > 0, network.apply(params, obs["board"])[0], FORBIDDEN))
 
     def act(params: PyTree, memory: PyTree, obs: Observation, noise: Noise) -> tuple[PyTree, PyTree, PyTree]:
-        found = look_ahead(params, obs, noise)
-        moved = move(found, memory, noise, manners)
-        weight = jnp.broadcast_to(noise["full"].numbers.astype(jnp.float32), moved.action.shape)
+        key, full = noise["search"].numbers, noise["full"].numbers
+
+        def look(simulations: int, explore: bool) -> Found:
+            return parts.look_ahead(simulations, explore, params, obs, key)
+
+        if config.full_search_fraction == 1:
+            found = look(config.num_simulations, True)
+        else:
+            found = jax.lax.cond(full, lambda: look(config.num_simulations, True), lambda: look(config.fast_simulations, False))
+        moved = move(found, memory, noise, parts.manners)
+        weight = jnp.broadcast_to(full.astype(jnp.float32), moved.action.shape)
         return moved.memory, moved.action, {"policy": found.policy, "policy_weight": weight, "resigns": moved.resigns}
 
     def greedy(params: PyTree, memory: PyTree, obs: Observation, noise: Noise) -> tuple[PyTree, PyTree, PyTree]:
-        positions = jax.vmap(whole.unpack)(obs["position"])
         if config.eval_simulations == 0:
-            logits, _ = network.apply(params, obs["board"])
-            return memory, jnp.argmax(jnp.where(obs[MASK] > 0, logits, FORBIDDEN), axis=-1).astype(jnp.int32), {}
-        return memory, search(game, evaluate, strong, params, positions, noise["search"].numbers, explore=False).action, {}
-
-    def remember(state: State, rollout: Rollout) -> State:
-        step, extras, positions = rollout.step, rollout.extras, rollout.obs["position"]
-        nothing = jnp.zeros(step.reward.shape)
-        new = Rows(positions, players(game, positions), extras["policy"], extras["policy_weight"], nothing, nothing > 0, extras["resigns"])
-        buffer = add_self_play(state.buffer, new, step.reward, step.done, longest)
-        return state._replace(buffer=buffer, env_steps=state.env_steps + rows)
-
-    def learn(state: State, key: Key[Array, ""]) -> tuple[State, Metrics]:
-        sampled = sample_self_play(state.buffer, key, config.batch_size)
-        batch = as_batch(game, sampled, config.symmetries)
-        (_, metrics), grads = jax.value_and_grad(alphazero_loss, has_aux=True)(state.params, batch, network, config.vf_coef)
-        rate = learning_rate(state.env_steps / config.total_steps)
-        direction, opt_state = optimizer.update(grads, state.opt_state, state.params)
-        metrics |= {"train/grad_norm": optax.tree.norm(grads), "train/learning_rate": rate}
-        metrics["train/known_outcomes"] = jnp.mean(batch.value_weight)
-        metrics["train/resign_checks"], metrics["train/resign_errors"] = false_resignations(sampled)
-        params = jax.tree.map(lambda p, d: p - rate * d, state.params, direction)
-        average = jax.tree.map(lambda a, p: a + config.averaging * (p - a), state.average, params)
-        sound = all_finite(metrics["train/loss"], metrics["train/grad_norm"])
-        kept = accept_if(sound, (params, average, opt_state), (state.params, state.average, state.opt_state))
-        return state._replace(params=kept[0], average=kept[1], opt_state=kept[2]), metrics
+            return memory, jnp.argmax(prior(params, obs), axis=-1).astype(jnp.int32), {}
+        return memory, parts.look_ahead(config.eval_simulations, False, params, obs, noise["search"].numbers).action, {}
 
     def update(state: State, rollout: Rollout, key: Key[Array, ""]) -> tuple[State, Metrics]:
-        state = remember(state, rollout)
-        state, metrics = jax.lax.scan(learn, state, jax.random.split(key, config.gradient_steps))
+        state = remember(parts, state, rollout)
+        state, metrics = jax.lax.scan(lambda state, key: learn(parts, state, key), state, jax.random.split(key, config.gradient_steps))
         return state, {name: jnp.mean(values) for name, values in metrics.items()}
 
-    def dynamics(state: State, rollout: PyTree) -> Metrics:
-        seen = as_batch(game, sample_self_play(state.buffer, key_to_look_by(state.env_steps), config.batch_size), symmetries=False)
-        age = spec.num_envs * (jnp.maximum(state.buffer.size, 1) - 1).astype(jnp.float32) / 2.0
-        looked = look_into(network, state.params, seen.board, mean_square_gradient(state.opt_state))
-        return looked | {"train/replay_age": age}
-
     return Algorithm(
-        init=init,
+        init=lambda key: init_state(parts, key),
         actor=lambda state: state.average,
         memory=fresh_memory,
-        draw=lambda key, steps: draw_moves(key, steps, spec.num_envs, game.num_actions, manners),
+        draw=lambda key, steps: draw_moves(key, steps, spec.num_envs, game.num_actions, parts.manners),
         act=act,
         greedy=greedy,
         value=lambda params, obs: win_value(network.apply(params, obs["board"])[1]),
         update=update,
-        observe=lambda state, rollout, key: (remember(state, rollout), {}),
-        needs=Needs(rollout_length=config.n_steps, on_policy=False, warmup_iterations=math.ceil(config.learning_starts / rows)),
-        probabilities=lambda params, memory, obs: jax.nn.softmax(
-            jnp.where(obs[MASK] > 0, network.apply(params, obs["board"])[0], FORBIDDEN)
-        ),
-        dynamics=dynamics,
+        observe=lambda state, rollout, key: (remember(parts, state, rollout), {}),
+        needs=Needs(rollout_length=config.n_steps, on_policy=False, warmup_iterations=math.ceil(config.learning_starts / parts.rows)),
+        probabilities=lambda params, memory, obs: prior(params, obs),
+        dynamics=lambda state, rollout: look_at(parts, state),
     )

@@ -3,7 +3,9 @@
 from collections.abc import Callable, Sequence
 from itertools import combinations
 from pathlib import Path
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias, cast
+
+import jax
 
 from thorndike.api.loading import LoadedPolicy, load
 from thorndike.errors import UserError
@@ -14,10 +16,11 @@ from thorndike.games.match import Match, as_record
 from thorndike.games.match import play_match as play
 from thorndike.games.match_file import PlayedGame
 from thorndike.games.pgn import write_pgn
-from thorndike.games.player_names import MCTS, RANDOM, check_player, mcts_simulations
+from thorndike.games.player_names import MCTS, RANDOM, TRAINED, check_player, mcts_simulations
 from thorndike.games.players import mcts_player, random_player
 from thorndike.games.registry import game as find_game
 from thorndike.games.sgf import can_be_sgf, write_sgf
+from thorndike.games.trained import trained_run
 from thorndike.statistics.ratings import Games, Ratings, fit_ratings
 
 PlayerLike: TypeAlias = str | Path | Player | LoadedPolicy
@@ -50,8 +53,10 @@ def player(who: PlayerLike, game: Game | str, *, simulations: int = SIMULATIONS,
             return mcts_player(rules, mcts_simulations(who, simulations), seed)
         if is_engine(who):
             return engine(who, rules.id)
+    if who == TRAINED:
+        return _agent(load(cast(Path, trained_run(rules.id))), rules, simulations)._replace(name=TRAINED)
     loaded = who if isinstance(who, LoadedPolicy) else load(who)
-    if loaded.facts["environment"] != rules.id:
+    if loaded.facts["environment"] not in (rules.id, game):
         raise UserError(f"{loaded.run} was trained on {loaded.facts['environment']}, not on {rules.id}")
     return _agent(loaded, rules, simulations)
 
@@ -75,7 +80,7 @@ def play_match(
     rules = find_game(game) if isinstance(game, str) else game
     if games < 1 or opening_plies < 0 or simulations < 0:
         raise UserError(f"a match needs games >= 1, opening_plies >= 0 and simulations >= 0; got {games}, {opening_plies}, {simulations}")
-    sides = player(first, rules, simulations=simulations, seed=seed), player(second, rules, simulations=simulations, seed=seed + 1)
+    sides = player(first, game, simulations=simulations, seed=seed), player(second, game, simulations=simulations, seed=seed + 1)
     try:
         return _played(rules, sides, games, seed, opening_plies, save, progress)
     finally:
@@ -100,7 +105,7 @@ def arena(
         raise UserError("an arena needs at least two players")
     if games < 1 or opening_plies < 0 or simulations < 0:
         raise UserError(f"an arena needs games >= 1, opening_plies >= 0 and simulations >= 0; got {games}, {opening_plies}, {simulations}")
-    sides = [player(who, rules, simulations=simulations, seed=seed + i) for i, who in enumerate(players)]
+    sides = [player(who, game, simulations=simulations, seed=seed + i) for i, who in enumerate(players)]
     try:
         names = _different([side.name for side in sides])
         sides = [side._replace(name=name) for side, name in zip(sides, names, strict=True)]
@@ -140,8 +145,6 @@ def _rows(pair: tuple[int, int], match: Match) -> list[Games]:
 
 
 def _agent(loaded: LoadedPolicy, rules: Game, simulations: int) -> Player:
-    import jax
-
     policy = loaded.policy
     actor, statistics = jax.tree.map(lambda leaf: leaf[policy.best], (policy.actors, policy.statistics))
     label = loaded.run.name if loaded.run is not None else "agent"

@@ -11,13 +11,13 @@ from thorndike.records import from_policy, read_policy_facts
 from thorndike.suggestions import did_you_mean
 
 GAME_HELP = "a game: connect_four, othello, go_9x9, chess, ...; or yours, path/to/file.py:NAME"
-PLAYER_HELP = "random, mcts, mcts:simulations=400, gnugo:level=3, rhino:level=3, stockfish:elo=1500, fairy:skill=-10, or a run"
+PLAYER_HELP = "random, mcts, mcts:simulations=400, trained, gnugo:level=3, rhino:level=3, stockfish:elo=1500, fairy:skill=-10, or a run"
 _ALONE = ("2048",)
 _WITH_DICE = ("backgammon",)
 
 
-def check_game(name: str, alone: bool) -> None:
-    """Raises UserError for a game that is not known, or, unless ``alone`` is right, is played by one."""
+def check_game(name: str, alone: bool) -> bool:
+    """Whether it is played by one. Raises UserError for a game that is not known, or, unless ``alone`` is right, is played by one."""
     if importlib.util.find_spec("mctx") is None:
         raise UserError("games are searched with mctx, which is not installed: pip install 'thorndike[games]'")
     if ":" in name:
@@ -29,6 +29,7 @@ def check_game(name: str, alone: bool) -> None:
         one = name in _ALONE
     if one and not alone:
         raise UserError(f"{name} is played by one, so nobody can play against anybody; see: thorndike play {name}")
+    return one
 
 
 def choose_player(text: str, game_name: str, output: Path) -> str | Path:

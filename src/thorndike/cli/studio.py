@@ -24,7 +24,7 @@ EXAMPLES = """\
 def run(words: Sequence[str]) -> Answer:
     """Serve the studio until the process is asked to stop."""
     parser = Parser("studio", "Play games in the browser, against what was trained, a search, or each other.", EXAMPLES)
-    parser.add_argument("--port", metavar="N", type=_port, default=PORT, help=f"where to listen; 0: any free one (default: {PORT})")
+    parser.add_argument("--port", metavar="N", type=port_number, default=PORT, help=f"where to listen; 0: any free one (default: {PORT})")
     parser.add_argument("--open", action="store_true", help="open the address in this machine's browser")
     host_help = "another address of this machine, to be reached from others (default: 127.0.0.1, this machine only)"
     parser.add_argument("--host", metavar="ADDRESS", default="127.0.0.1", help=host_help)
@@ -55,7 +55,8 @@ def run(words: Sequence[str]) -> Answer:
     return Answer({"status": "ended"}, "")
 
 
-def _port(text: str) -> int:
+def port_number(text: str) -> int:
+    """A port, or 0 for any that is free."""
     if not (text.isascii() and text.isdecimal() and len(text) <= 5 and int(text) < 2**16):
         raise ArgumentTypeError(f"expected a port from 0 (any free one) to 65535; got '{text}'")
     return int(text)

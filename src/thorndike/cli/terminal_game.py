@@ -1,6 +1,7 @@
 """A person at the terminal against a player: the board as text, moves by name, advice, take back, save."""
 
 import threading
+import time
 from pathlib import Path
 
 from thorndike.cli.answer import printable
@@ -23,13 +24,16 @@ _LINE = 5
 class TerminalGame:
     """One game, asked for line by line."""
 
-    def __init__(self, game: Game, opponent: Player | None, adviser: Player | None, person: int, seed: int) -> None:
+    def __init__(
+        self, game: Game, opponent: Player | None, adviser: Player | None, person: int, seed: int, opponent_compiles: bool = False
+    ) -> None:
         """``opponent`` None: the person plays alone; ``person``: 0 moves first, 1 second."""
+        self._opponent_compiles = opponent_compiles
         self._game, self._opponent, self._adviser, self._person, self._seed = game, opponent, adviser, person, seed
         self._plies = [first_ply(game, seed)]
         self._actions: list[int] = []
         self._choices: dict[int, Choice] = {}
-        self._score = 0.0
+        self._score, self._slowest = 0.0, 0.0
         self._gave_up, self._left = False, False
         self._warming = threading.Thread(target=self._warm_up, daemon=True)
 
@@ -49,6 +53,8 @@ class TerminalGame:
                 self._ask(self._opponent)
             else:
                 self._listen()
+        # A program that leaves while it compiles may crash.
+        self._warming.join()
 
     def close(self) -> None:
         """End the opponent, and who advises."""
@@ -62,7 +68,8 @@ class TerminalGame:
         score = None if not over else self._score if self._opponent is None else self._outcome()
         against = None if self._opponent is None else self._opponent.name
         names = self._names()
-        return {"game": self._game.id, "against": against, "person": self._person, "over": over, "score": score, "moves": names}
+        told = {"game": self._game.id, "against": against, "person": self._person, "over": over, "score": score, "moves": names}
+        return {**told, "slowest_answer_s": self._slowest}
 
     def farewell(self) -> str:
         """The last line."""
@@ -87,13 +94,16 @@ class TerminalGame:
     def _warm_up(self) -> None:
         """Compile while the person looks at the board, so that the first answer comes as fast as the others."""
         next_ply(self._game, self._plies[0], self._plies[0].legal[0], self._seed)
-        if self._opponent is not None and self._person == 0:
+        if self._opponent is not None and self._opponent_compiles and self._person == 0:
             self._opponent.choose(Turn(self._game, self._plies[0].position, ()))
 
     def _asked(self, player: Player) -> Choice:
         if self._warming.is_alive():
             self._warming.join()
-        return player.choose(Turn(self._game, self._now.position, tuple(self._actions)))
+        began = time.monotonic()
+        choice = player.choose(Turn(self._game, self._now.position, tuple(self._actions)))
+        self._slowest = max(self._slowest, time.monotonic() - began)
+        return choice
 
     def _ask(self, player: Player) -> None:
         choice = self._asked(player)

@@ -47,7 +47,9 @@ def observed_position(game: Game, position: Position) -> Observation:
 
 def game_environment(game: Game, num_envs: int, settings: GameSettings = SELF_PLAY) -> Environment:
     """``num_envs`` games side by side, each begun anew when it ends, as ``settings`` say. Raises ``UserError`` if there are none."""
-    share, plies = settings.opening_share, game.max_moves // 4 if settings.opening_plies is None else settings.opening_plies
+    # Dice make games differ by themselves.
+    usual = 0 if game.has_chance else game.max_moves // 4
+    share, plies = settings.opening_share, usual if settings.opening_plies is None else settings.opening_plies
     if num_envs < 1:
         raise UserError(f"num_envs of {game.id} must be at least 1, not {num_envs}: give a larger number")
     pool = -(-num_envs // _POOL)

@@ -4,26 +4,29 @@ from collections.abc import Iterable
 
 from thorndike.errors import UserError
 from thorndike.games.engines import ENGINES, PROTOCOLS, check_engine, is_engine, read_settings
+from thorndike.games.trained import trained_run
 from thorndike.suggestions import nearest
 
-RANDOM, MCTS = "random", "mcts"
+RANDOM, MCTS, TRAINED = "random", "mcts", "trained"
 _OF_MCTS = {"simulations": (1, 1_000_000)}
 
 
 def known_players() -> tuple[str, ...]:
     """By their short names."""
-    return (RANDOM, MCTS, *ENGINES)
+    return (RANDOM, MCTS, TRAINED, *ENGINES)
 
 
 def is_run(text: str) -> bool:
     """Whether a player's name is none of the short ones."""
-    return not (text == RANDOM or text.partition(":")[0] == MCTS or is_engine(text))
+    return not (text in (RANDOM, TRAINED) or text.partition(":")[0] == MCTS or is_engine(text))
 
 
 def check_player(text: str, game: str, can_be_searched: bool) -> None:
     """Raises UserError for a short name that cannot play. Whether a run is there is for others to say."""
     if is_engine(text):
         check_engine(text, game)
+    elif text == TRAINED and trained_run(game) is None:
+        raise UserError(f"no trained policy comes with {game}; train one, or play against mcts")
     elif text.partition(":")[0] == MCTS:
         mcts_simulations(text, 1)
         if not can_be_searched:

@@ -157,6 +157,7 @@ class _BoardPage:
         self._restart.set_attribute(
             "data-asks", "Begin a new game? The moves of this one are lost." if view.moves and not drawn.over else None
         )
+        self._from_here.set_attribute("hidden", True if view.at_end else None)
         self._take_back.set_attribute("disabled", None if view.moves else True)
         for number, (line, seat) in enumerate(zip(self._players, view.seats, strict=True)):
             line.set_text(f"{self._look.sides[number]}: {seat.name}")

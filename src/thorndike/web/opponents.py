@@ -9,6 +9,7 @@ from thorndike.errors import UserError
 from thorndike.games.engines import ENGINES, program_of
 from thorndike.games.game import Game, Player
 from thorndike.games.registry import game as find_game
+from thorndike.games.trained import trained_run
 
 PERSON = "person"
 STRENGTHS = (16, 64, 200, 800, 3200)
@@ -57,6 +58,8 @@ def opponents_in(output: Path) -> Opponents:
             for run in reversed(all_runs(output))
             if _trained_on(run, game_id)
         ]
+        if (shipped := trained_run(game_id)) is not None:
+            found.append(_named(str(shipped), "Thorndike's own", searched, before="Trained: "))
         if searched and game_id not in _LONG:
             found.append(_named("mcts", "Tree search", searches=True, after=", without a network"))
         found += [_named(name, _ENGINE_NAMES.get(name, name)) for name in ENGINES if _plays(name, game_id)]

@@ -28,20 +28,30 @@ def serve(games: Sequence[str], opponents: Opponents, host: str, port: int, told
 
     Raises UserError where the address cannot be had. One studio a process: NiceGUI has one app.
     """
+    studio = Studio(games, opponents)
+    try:
+        serve_app(_pages(studio), host, port, lambda root, token: told(f"{root}/?token={token}"), token)
+    finally:
+        studio.close()
+
+
+def serve_app(app: FastAPI, host: str, port: int, told: Callable[[str, str], None], token: str | None = None) -> None:
+    """Serve an app behind the gate until the process is asked to stop. ``told`` gets its root address and the token, once it answers.
+
+    Raises UserError where the address cannot be had.
+    """
     token = token or secrets.token_urlsafe(24)
     bound = _bind(host, port)
     port = bound.getsockname()[1]
-    studio = Studio(games, opponents)
-    gate = Gate(_pages(studio), token, host, port)
+    gate = Gate(app, token, host, port)
     shown = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(host, f"[{host}]" if ":" in host else host)
     config = uvicorn.Config(gate, log_level="critical", access_log=False, timeout_graceful_shutdown=_GRACEFUL_S, server_header=False)
     server = uvicorn.Server(config)
     bound.listen(128)
-    told(f"http://{shown}:{port}/?token={token}")
+    told(f"http://{shown}:{port}", token)
     try:
         server.run(sockets=[bound])
     finally:
-        studio.close()
         with contextlib.suppress(OSError):
             bound.close()
 

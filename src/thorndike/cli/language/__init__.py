@@ -13,6 +13,10 @@ LANGUAGE_VERBS = {
     "chat": "talk with a model in the terminal",
     "pretrain": "a small model from nothing: its tokenizer and its parameters from plain text",
     "sft": "fine-tune a model on texts, prompts with completions, or conversations",
+    "import": "put preferences, or candidates to be compared, into a store",
+    "label": "a page on which people say which answer, or which clip, is better",
+    "agree": "how far raters agree, and how far each can be trusted",
+    "export": "a store's preferences as a file that TRL's trainers read",
     "reward": "a reward model from preferences, and how far it can be trusted",
     "ppo": "PPO towards a reward, held close to the base",
     "grpo": "GRPO: several completions of a prompt as each other's baseline",
@@ -28,6 +32,8 @@ EXAMPLES = """\
   thorndike language generate runs/base/model --prompt "The film was" --samples 4
   thorndike language sft runs/base/model --data answers.jsonl --out runs/tuned
   thorndike language chat runs/tuned/model
+  thorndike language demo --out runs/demo
+  thorndike language label --db prefs.db
 `thorndike language VERB --help` tells more."""
 
 

@@ -34,8 +34,8 @@ def import_records(store: Store, project: int, records: Records, rater: str, pla
         if ask:
             return Imported(store.add_items(project, items), 0)
         return Imported(*store.add_judged(project, store.rater(rater), [(item, [0, 1]) for item in items]))
-    if records.format == "candidates":
-        rows: Iterable[NewItem] = [_item(row, number) for row, number in zip(records.rows, records.numbers, strict=True)]
+    if records.format in ("candidates", "completions"):
+        rows: Iterable[NewItem] = [_item(row, records.format, number) for row, number in zip(records.rows, records.numbers, strict=True)]
     elif records.format in ("prompt_completion", "unpaired_preference"):
         rows = _together(records)
     else:
@@ -72,8 +72,8 @@ def _pair(row: Mapping[str, object]) -> NewItem:
     return NewItem(_content(row["prompt"]), (chosen, rejected))
 
 
-def _item(row: Mapping[str, object], number: int) -> NewItem:
-    given, models, best, priority = row["candidates"], row.get("models"), row.get("best"), row.get("priority", 0)
+def _item(row: Mapping[str, object], column: str, number: int) -> NewItem:
+    given, models, best, priority = row[column], row.get("models"), row.get("best"), row.get("priority", 0)
     assert isinstance(given, list)
     if models is not None and not (
         isinstance(models, list) and len(models) == len(given) and all(isinstance(each, str) for each in models)

@@ -19,12 +19,13 @@ Row: TypeAlias = dict[str, object]
 FORMATS: dict[str, tuple[str, ...]] = {
     "preference": ("chosen", "rejected"),
     "candidates": ("prompt", "candidates"),
+    "completions": ("prompt", "completions"),
     "unpaired_preference": ("prompt", "completion", "label"),
     "prompt_completion": ("prompt", "completion"),
     "language_modeling": ("text",),
     "prompt_only": ("prompt",),
 }
-"""The columns that make each format, the most telling ones first. ``candidates`` is ours: several completions to be compared."""
+"""The columns that make each format, the most telling ones first; of several candidates in ours (``generate`` writes ``completions``)."""
 ENDINGS = (".jsonl", ".json", ".csv")
 
 _ANSWERS = ("chosen", "rejected", "completion", "text", "messages")
@@ -84,15 +85,7 @@ def write_records(path: str | Path, rows: Iterable[Mapping[str, object]]) -> int
     """
     path = Path(path)
     written = [dict(row) for row in rows]
-    match path.suffix.lower():
-        case ".jsonl":
-            text = "".join(json.dumps(row, ensure_ascii=False, allow_nan=False) + "\n" for row in written)
-        case ".json":
-            text = json.dumps(written, ensure_ascii=False, allow_nan=False, indent=1) + "\n"
-        case ".csv":
-            text = _as_csv(written)
-        case _:
-            raise UserError(f"{path}: expected a file that ends in {', '.join(ENDINGS)}")
+    text = as_text(written, path.suffix.lower(), path)
     aside = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         with aside.open("w", encoding="utf-8", newline="") as file:
@@ -104,6 +97,18 @@ def write_records(path: str | Path, rows: Iterable[Mapping[str, object]]) -> int
         aside.unlink(missing_ok=True)
         raise UserError(f"{path} cannot be written: {error.strerror}") from error
     return len(written)
+
+
+def as_text(rows: Sequence[Row], ending: str, where: str | Path) -> str:
+    """Rows in the form that an ending of ``ENDINGS`` tells."""
+    match ending:
+        case ".jsonl":
+            return "".join(json.dumps(row, ensure_ascii=False, allow_nan=False) + "\n" for row in rows)
+        case ".json":
+            return json.dumps(rows, ensure_ascii=False, allow_nan=False, indent=1) + "\n"
+        case ".csv":
+            return _as_csv(rows)
+    raise UserError(f"{where}: expected a file that ends in {', '.join(ENDINGS)}")
 
 
 def with_explicit_prompt(row: Mapping[str, object]) -> Row:
@@ -139,8 +144,8 @@ def _format_of(row: Mapping[str, object], place: str) -> str:
 
 def _check_row(kind: str, row: Mapping[str, object], place: str) -> bool:
     """Whether the row is conversational; raises where it is neither."""
-    if kind == "candidates":
-        return _check_candidates(row, place)
+    if kind in ("candidates", "completions"):
+        return _check_candidates(row, kind, place)
     columns = ("messages",) if "messages" in row else FORMATS[kind]
     texts = [column for column in (*columns, *(("prompt",) if "prompt" in row else ())) if column != "label"]
     kinds = {column: _is_messages(row[column], f"{place}: '{column}'", column in _ANSWERS or kind == "prompt_only") for column in texts}
@@ -154,10 +159,10 @@ def _check_row(kind: str, row: Mapping[str, object], place: str) -> bool:
     return next(iter(kinds.values()))
 
 
-def _check_candidates(row: Mapping[str, object], place: str) -> bool:
-    given = row["candidates"]
+def _check_candidates(row: Mapping[str, object], kind: str, place: str) -> bool:
+    given = row[kind]
     if not isinstance(given, list) or len(given) < 2:
-        raise UserError(f"{place}: 'candidates' is {quoted(given)}, but it must be a list of at least 2")
+        raise UserError(f"{place}: '{kind}' is {quoted(given)}, but it must be a list of at least 2")
     kinds = [_is_content(each, f"{place}: candidate {number}") for number, each in enumerate(given, start=1)]
     prompt = _is_content(row["prompt"], f"{place}: 'prompt'")
     return prompt or any(kinds)

@@ -82,6 +82,12 @@ class Store:
         """The rater of that name, made where there is none."""
         return self._number(schema.rater, _checked_name("a rater", name))
 
+    def rater_of(self, assignment: int) -> int | None:
+        """Whose assignment it is; None if there is none of that number."""
+        asked = schema.assignment
+        with self.database.reading() as connection:
+            return connection.execute(select(asked.c.rater_id).where(asked.c.id == assignment)).scalar_one_or_none()
+
     def add_items(self, project: int, items: Iterable[NewItem]) -> int:
         """Add questions, all or none of them; how many were new. One with the same prompt and candidates as another is not added again."""
         with self.database.writing() as connection:

@@ -4,7 +4,7 @@ const CHESS = { k: "♚", q: "♛", r: "♜", b: "♝", n: "♞", p: "♟" };
 export default {
   template: `
     <div class="board" :class="['is-' + pieces, playable ? 'is-playable' : '', 'side-' + side]" role="grid" :aria-label="name"
-         :style="{ '--rows': rows.length, '--columns': rows[0].length }" @keydown="onKey">
+         :style="{ '--rows': rows.length, '--columns': rows[0].length, '--names': namesWidth }" @keydown="onKey">
       <div v-for="(squares, row) in rows" role="row" class="board-row" :style="{ '--row': row }">
         <span class="name" aria-hidden="true">{{ rowNames[row] }}</span>
         <button v-for="(piece, column) in squares" type="button" role="gridcell" class="square" :key="column"
@@ -49,6 +49,9 @@ export default {
   computed: {
     round() {
       return ["discs", "stones", "go", "hex"].includes(this.pieces);
+    },
+    namesWidth() {
+      return this.rowNames.some((each) => each.length > 2) ? "2.5rem" : "1.25rem";
     },
     byPlace() {
       return Object.fromEntries((this.shares ?? []).map(([row, column, share]) => [row + "," + column, share]));
