@@ -167,3 +167,56 @@ def test_the_report_needs_nothing_else(tmp_path: Path) -> None:
     page = files.page.read_text()
     assert "70.0% [60.0%, 80.0%]" in page and "<script>" not in page and "far &lt;away&gt;" in page and "http" not in page
     assert files.picture.read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.slow
+def test_the_demo_from_end_to_end_goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from thorndike.language import demo
+    from thorndike.language.decoder import initial_params
+    from thorndike.language.pretraining import Config as ModelSize
+    from thorndike.language.pretraining import small_llama, train_tokenizer
+
+    words = [
+        "the",
+        "film",
+        "was",
+        "very",
+        "good",
+        "bad",
+        "long",
+        "fine",
+        "story",
+        "and",
+        "not",
+        "a",
+        "play",
+        "of",
+        "love",
+        "with",
+        "some",
+        "war",
+        "in",
+        "it",
+    ]
+    generator = np.random.default_rng(0)
+    reviews = [" ".join(generator.choice(words, 60)) for _ in range(60)]
+    tokenizer = train_tokenizer(reviews, 400)
+    config = small_llama(ModelSize(vocab_size=400, hidden_size=16, num_layers=1, num_heads=2, intermediate_size=24), tokenizer)
+    base = LanguageModel(config, initial_params(config, jax.random.key(0)), tokenizer)
+    rated = []
+    for _ in range(2400):
+        text = " ".join(generator.choice(words, 6))
+        kind = 2 * ("good" in text) + ("fine" in text) - 2 * ("bad" in text)
+        rated.append(sentiment.Rated(text, (kind, kind + 1)))
+    train, held_out = demo.review_prompts(reviews, tokenizer, 16)
+    assert all(text.startswith(" ") for text in train.texts)
+    data = demo.Data(base, train, held_out, rated, sentiment.Lexicon({"good": 2.0, "bad": -2.0, "fine": 1.0}))
+    small = demo.Config(total_steps=2, episodes=16, max_new_tokens=4, reward_epochs=8, pairs=40, held_out=16)
+    lines: list[str] = []
+    found = demo.run_demo(tmp_path / "run", data, small, ("ppo", "grpo", "rloo", "dpo", "ppo_without_kl"), 0, lines.append)
+    assert {"labels", "reward", "best_of_n", "ppo", "grpo", "rloo", "dpo", "ppo_without_kl"} <= set(found)
+    assert (tmp_path / "run" / "ppo" / "model" / "config.json").is_file()
+    again = demo.run_demo(tmp_path / "run", data, small, ("ppo", "grpo", "rloo", "dpo", "ppo_without_kl"), 0, lines.append)
+    assert {name: part for name, part in again.items() if name != "wall_s"} == {
+        name: part for name, part in found.items() if name not in ("wall_s",)
+    }

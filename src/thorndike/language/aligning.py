@@ -114,8 +114,8 @@ def train_reward_model(
 def align(
     folder: Path, rewards: Sequence[Reward], prompts: Sequence[Path], out: Path, learner: str, settings: Mapping[str, object], *,
     limits: Limits, lora: LoraConfig | None = None, seed: int = 0, told: Told | None = None,
-) -> tuple[Outcome, Comparison]:  # fmt: skip
-    """PPO, GRPO or RLOO into ``out``; its ``model`` is a Hugging Face folder. Goes on where it stopped.
+) -> tuple[Outcome, Comparison | None]:  # fmt: skip
+    """PPO, GRPO or RLOO into ``out``; its ``model`` is a Hugging Face folder. Goes on where it stopped; no comparison if interrupted.
 
     A tenth of the prompts (at most 256) is kept to compare with the base on, in ``comparison.json`` with samples of both.
     """
@@ -140,6 +140,8 @@ def align(
     })  # fmt: skip
     task = Task(base, train, reward.score, _members(reward))
     outcome = train_policy(task, built, config, out, seed=seed, limits=limits, told=told)
+    if not outcome.finished:
+        return outcome, None
     found = compare_with_base(
         base,
         outcome.params,

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -37,7 +37,7 @@ from thorndike.language.text_run import MODEL, open_run
 from thorndike.language.tokenizer import Tokenizer
 from thorndike.language.win_rate import Comparison, compare_with_base
 from thorndike.settings import AtLeast, MoreThan, check, settings_of
-from thorndike.training.run_directory import write_json
+from thorndike.training.run_directory import read_lines, write_json
 
 PROMPT_LENGTH = 8
 
@@ -74,14 +74,18 @@ Tell = Callable[[str], None]
 
 
 def review_prompts(texts: Sequence[str], tokenizer: Tokenizer, held_out: int) -> tuple[Prompts, Prompts]:
-    """The first tokens of windows of reviews that the base has not read; those for the comparison are of other reviews.
+    """The first tokens of windows, from a word on, of reviews that the base has not read; those to compare on are of other reviews.
 
     Raises ``UserError`` where there are too few.
     """
     found: dict[tuple[int, ...], int] = {}
+    begins = {token for token in range(tokenizer.vocab_size) if tokenizer.decode([token]).startswith(" ")}
     for review, tokens in enumerate(tokenizer.encode_many(texts)):
-        for start in range(0, len(tokens) - PROMPT_LENGTH + 1, 3 * PROMPT_LENGTH):
-            found.setdefault(tuple(tokens[start : start + PROMPT_LENGTH]), review)
+        last = -3 * PROMPT_LENGTH
+        for start in range(len(tokens) - PROMPT_LENGTH + 1):
+            if tokens[start] in begins and start >= last + 3 * PROMPT_LENGTH:
+                found.setdefault(tuple(tokens[start : start + PROMPT_LENGTH]), review)
+                last = start
     order = sorted(found, key=lambda window: found[window])
     if len(order) <= held_out:
         raise UserError(f"the held-out reviews give {len(order)} prompts; the demo needs more than {held_out}")
@@ -205,17 +209,22 @@ def _by_rewards(
         of_groups = _group_settings(config, "group" if name == "grpo" else "leave_one_out")
         settings, learner = of_groups, groups.grpo(of_groups, base.config, base.params)
     open_run(run, {"verb": name, "seed": seed, "settings": settings_of(settings)})
-    seen: list[dict[str, float]] = []
 
     def follow(step: int, values: dict[str, float]) -> None:
-        seen.append({"step": step} | {name: values[f"objective/{name}"] for name in ("score", "gold", "kl")})
         if step % 10 == 0:
             tell(f"{name}, step {step}: proxy {values['objective/score']:.2f}, gold {values['objective/gold']:.2f}, "
                  f"{values['objective/kl']:.1f} nats")  # fmt: skip
 
     task = Task(base, data.train, score, members if len(model.members) > 1 else None, {"gold": data.gold.score})
     outcome = train_policy(task, learner, settings, run, seed=seed, limits=limits, told=follow)
-    return outcome.params, {"iterations": outcome.iterations, "stopped": outcome.stopped, "kl_in_training": outcome.kl, "curve": seen}
+    if not outcome.finished:
+        raise UserError(f"interrupted after {outcome.iterations} iterations of {name}; the same command goes on from there")
+    return outcome.params, {
+        "iterations": outcome.iterations,
+        "stopped": outcome.stopped,
+        "kl_in_training": outcome.kl,
+        "curve": _curve(run),
+    }
 
 
 def _ppo_settings(config: Config, free: bool) -> proximal.Config:
@@ -248,6 +257,13 @@ def _group_settings(config: Config, baseline: str) -> groups.Config:
         kl_in="reward",
         target_kl=config.target_kl,
     )
+
+
+def _curve(run: Path) -> list[dict[str, float]]:
+    """Proxy, gold and divergence of every iteration, from the log: an interrupted run has them from its first one."""
+    rows = read_lines(run / "metrics.jsonl")
+    names = ("score", "gold", "kl")
+    return [{"step": float(str(row["steps"]))} | {name: cast(list[float], row[f"objective/{name}"])[0] for name in names} for row in rows]
 
 
 def _by_dpo(data: Data, config: Config, seed: int) -> Params:

@@ -76,7 +76,11 @@ def run_policy_verb(verb: str, summary: str, words: Sequence[str]) -> Answer:
         options.model, rewards, options.prompts, options.out, verb, settings, limits=limits, lora=lora_of(options.lora), seed=options.seed,
         told=told,
     )  # fmt: skip
-    data = {"run": options.out, "model": options.out / "model", "iterations": outcome.iterations, "stopped": outcome.stopped}
+    data: dict[str, object] = {"run": options.out, "iterations": outcome.iterations, "stopped": outcome.stopped}
+    if found is None:
+        text = f"interrupted after {outcome.iterations} iterations\nthe same command again goes on from here"
+        return Answer(data | {"status": "interrupted"}, text, 130)
+    data |= {"status": "finished", "model": options.out / "model"}
     text = f"{outcome.iterations} iterations" + (f", stopped: {outcome.stopped}" if outcome.stopped else "")
     return Answer(data | comparison_data(found), f"{text}\n{in_words(found)}\nmodel: {options.out / 'model'}")
 
