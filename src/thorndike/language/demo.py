@@ -237,8 +237,6 @@ def _ppo_settings(config: Config, free: bool) -> proximal.Config:
         max_prompt_length=PROMPT_LENGTH,
         max_new_tokens=config.max_new_tokens,
         learning_rate=config.learning_rate if free else f"linear({config.learning_rate}, 0)",
-        # With a value that is still 0 a smaller one would weigh tokens by their place alone.
-        gae_lambda=1.0,
         kl_coefficient=0.0 if free else 0.15,
         target_kl=None if free else config.target_kl,
     )
