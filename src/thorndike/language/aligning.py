@@ -225,10 +225,14 @@ def _base_samples(base: LanguageModel, data: ComparisonData, seed: int) -> list[
 
 
 def _value_params(reward: Rewards, base: LanguageModel) -> object | None:
-    """The first reward model, its head scaled as its rewards are; nothing where it is of another shape than the policy."""
-    if not reward.models:
+    """The first reward model, its head scaled as its rewards are; nothing where it cannot say what a text is worth half-way.
+
+    That is where it is of another shape than the policy, or its head has learnt to read the mean of all tokens: at single ones its numbers
+    are so far off (explained variance -12 on the demo's first texts) that the policy drifts for nothing until they are unlearnt.
+    """
+    model = next((model for model in reward.models if model.pool == "last"), None)
+    if model is None:
         return None
-    model = reward.models[0]
     if (model.config.hidden_size, model.config.num_layers) != (base.config.hidden_size, base.config.num_layers):
         return None
     return {**model.members[0], "score": {"kernel": model.members[0]["score"]["kernel"] / model.deviation}}

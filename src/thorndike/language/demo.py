@@ -107,7 +107,8 @@ def demo(out: Path, base: Path | None, config: Config, learners: Sequence[str], 
 
 def run_demo(out: Path, data: Data, config: Config, learners: Sequence[str], seed: int, tell: Tell) -> dict[str, object]:
     """All stages; what was found, as ``report.json`` holds it."""
-    open_run(out, {"verb": "demo", "seed": seed, "learners": list(learners), "settings": settings_of(config)})
+    # Not the learners: another may be added to what is there.
+    open_run(out, {"verb": "demo", "seed": seed, "settings": settings_of(config)})
     began = time.perf_counter()
     found: dict[str, object] = {"seed": seed}
     kept = Kept(out, tell)
@@ -201,10 +202,9 @@ def _by_rewards(
     if name.startswith("ppo"):
         free = name == "ppo_without_kl"
         limits = Limits(None, None, None, None) if free else limits
-        value = {**model.members[0], "score": {"kernel": model.members[0]["score"]["kernel"] / model.deviation}}
         of_ppo = _ppo_settings(config, free)
         settings: proximal.Config | groups.Config = of_ppo
-        learner = proximal.ppo(of_ppo, base.config, base.params, value)
+        learner = proximal.ppo(of_ppo, base.config, base.params)
     else:
         of_groups = _group_settings(config, "group" if name == "grpo" else "leave_one_out")
         settings, learner = of_groups, groups.grpo(of_groups, base.config, base.params)

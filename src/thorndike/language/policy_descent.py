@@ -18,7 +18,9 @@ from thorndike.language.rollouts import Rollout, before_tokens
 from thorndike.types import Metrics, Number
 
 RATIO_TOLERANCE = {"float32": 1e-3, "bfloat16": 0.25}
-"""By how much a probability of the forward pass may differ from that of sampling, before anything was learnt. Measured: 1e-6 to 2e-5."""
+"""By how much a probability of the forward pass may differ from that of sampling, before anything was learnt.
+
+Measured on a CPU: at most 9e-6 in 26 iterations of the demo. Accelerators multiply float32 in fewer bits."""
 
 
 class PolicyTerms(NamedTuple):
