@@ -19,6 +19,7 @@ from thorndike.games.pgn import write_pgn
 from thorndike.games.player_names import MCTS, RANDOM, TRAINED, check_player, mcts_simulations
 from thorndike.games.players import mcts_player, random_player
 from thorndike.games.registry import game as find_game
+from thorndike.games.registry import is_game
 from thorndike.games.sgf import can_be_sgf, write_sgf
 from thorndike.games.trained import trained_run
 from thorndike.statistics.ratings import Games, Ratings, fit_ratings
@@ -56,8 +57,10 @@ def player(who: PlayerLike, game: Game | str, *, simulations: int = SIMULATIONS,
     if who == TRAINED:
         return _agent(load(cast(Path, trained_run(rules.id))), rules, simulations)._replace(name=TRAINED)
     loaded = who if isinstance(who, LoadedPolicy) else load(who)
-    if loaded.facts["environment"] not in (rules.id, game):
-        raise UserError(f"{loaded.run} was trained on {loaded.facts['environment']}, not on {rules.id}")
+    trained_on = str(loaded.facts["environment"])
+    # A game of the user's own is called by its file or module where it was trained by its name.
+    if trained_on != rules.id and not (is_game(trained_on) and find_game(trained_on).id == rules.id):
+        raise UserError(f"{loaded.run} was trained on {trained_on}, not on {rules.id}")
     return _agent(loaded, rules, simulations)
 
 
