@@ -31,9 +31,8 @@ def main() -> None:
         found = np.asarray(logits(params, config, hidden_states(params, config, tokens, segments)) * segments[..., None])
         relative = np.abs(found - expected["logits"]).max() / np.abs(expected["logits"]).max()
         texts = generate(params, config, tokens, segments, jax.random.key(0), max_new_tokens=64, sampling=GREEDY)
-        print(
-            f"{folder.name:14} {config.model_type:12} {relative:.1e} {int((texts.tokens == expected['greedy']).sum())}/{expected['greedy'].size}"
-        )
+        agree = f"{int((texts.tokens == expected['greedy']).sum())}/{expected['greedy'].size}"
+        print(f"{folder.name:14} {config.model_type:12} {relative:.1e} {agree}")
 
 
 if __name__ == "__main__":

@@ -103,7 +103,7 @@ def test_the_search_plays_nim_as_its_theory_says():
     assert nim.action_name(start, int(found.action[0])) == "a2"
 
 
-def test_nim_is_trained_by_its_name(tmp_path):
+def test_nim_is_trained_by_its_name(tmp_path, quick_compile):
     name = f"{EXAMPLES / 'own_game.py'}:NIM"
     small = {"n_steps": 2, "batch_size": 16, "gradient_steps": 1, "learning_starts": 32, "num_simulations": 4, "width": 8, "blocks": 0}
     result = td.train("alphazero", name, steps=128, num_envs=16, settings=small, output=tmp_path)

@@ -9,6 +9,8 @@ from thorndike.games.against import AgainstOpponent
 from thorndike.games.settings import GameSettings, game_settings
 from thorndike.games.tic_tac_toe import TIC_TAC_TOE
 
+pytestmark = pytest.mark.usefixtures("quick_compile")
+
 
 def stones(obs) -> int:
     return int(obs["board"].sum())
@@ -44,6 +46,7 @@ def test_a_move_that_is_not_legal_loses():
     assert (reward, terminated) == (-1.0, True)
 
 
+@pytest.mark.slow
 def test_plain_search_beats_random_moves():
     env = AgainstOpponent(TIC_TAC_TOE, GameSettings(opponent="mcts", opponent_simulations=50, eval_opening_plies=0))
     random, results = np.random.default_rng(0), []

@@ -71,12 +71,12 @@ def chooser(run: Path, simulations: int) -> lines.Choose:
     loaded = td.load(run)
     policy = loaded.policy
     algorithm = build_algorithm("alphazero", {**loaded.facts["config"], "eval_simulations": simulations}, policy.spec, None)
-    actor, noise = jax.tree.map(lambda leaf: leaf[0], policy.actors), policy.noise(jax.random.key(0), 256)
+    actor, noise = jax.tree.map(lambda leaf: leaf[0], policy.actors), policy.noise(jax.random.key(0), lines.SIDE_BY_SIDE)
     see = jax.vmap(lambda position: observed_position(TIC_TAC_TOE, position))
-    return jax.jit(lambda positions: algorithm.greedy(actor, algorithm.memory(256), see(positions), noise)[1])
+    return jax.jit(lambda positions: algorithm.greedy(actor, algorithm.memory(lines.SIDE_BY_SIDE), see(positions), noise)[1])
 
 
-def test_a_run_is_saved_loaded_and_gone_on_with(tmp_path: Path):
+def test_a_run_is_saved_loaded_and_gone_on_with(tmp_path: Path, quick_compile: None):
     small = {"n_steps": 2, "batch_size": 32, "gradient_steps": 1, "learning_starts": 64, "num_simulations": 4, "width": 8, "blocks": 0}
     result = td.train("alphazero", "tic_tac_toe", steps=256, num_envs=16, settings=small, preset="none", output=tmp_path)
     evaluation = td.load(result.run).evaluate(episodes=10)

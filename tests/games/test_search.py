@@ -14,6 +14,8 @@ from thorndike.games.connect_four import CONNECT_FOUR
 from thorndike.games.search import SEARCHES, SearchSettings, by_playouts, search
 from thorndike.games.tic_tac_toe import TIC_TAC_TOE
 
+pytestmark = pytest.mark.usefixtures("quick_compile")
+
 KEY = jax.random.key(0)
 POSITION = (0b000010001, 0b100000010)
 """X on the first and fifth square, O on the second and ninth; X to move."""
@@ -89,7 +91,7 @@ def plain_search(pieces, simulations, c_init):
     return root
 
 
-@pytest.mark.parametrize("simulations", [1, 8, 40])
+@pytest.mark.parametrize("simulations", [8, 40])
 def test_puct_is_the_plain_search(simulations):
     settings = SearchSettings("puct", simulations, c_puct=1.25)
     found = search(TIC_TAC_TOE, evaluate_made_up, settings, (), lines.batch([POSITION]), KEY, explore=False)
@@ -101,39 +103,13 @@ def test_puct_is_the_plain_search(simulations):
     assert found.action[0] == np.argmax(visits)
 
 
-@pytest.fixture(scope="module")
-def perfect():
-    """Positions -> no preference among moves, and their true values."""
-    table = np.zeros((512, 512), np.float32)
-    for pieces in lines.states():
-        table[pieces] = lines.value(pieces) * (1 if lines.mover(pieces) == 0 else -1)
-    flat = jnp.asarray(table.reshape(-1))
-
-    def evaluate(params, positions, key):
-        del params, key
-        index = (positions.pieces[:, 0] * 512 + positions.pieces[:, 1]).astype(jnp.int32)
-        return jnp.zeros((index.shape[0], 9)), flat[index]
-
-    return evaluate
-
-
 @pytest.mark.parametrize("kind", SEARCHES)
-@pytest.mark.parametrize("agent", [0, 1])
-def test_with_perfect_values_no_line_of_tic_tac_toe_is_lost(kind, agent, perfect):
-    # Perfect values are not enough for a handful of simulations: a move's value is the mean of what was tried after it, blunders too.
-    settings = SearchSettings(kind, 256)
-    choose = jax.jit(lambda positions: search(TIC_TAC_TOE, perfect, settings, (), positions, KEY, explore=False).action)
-    found = lines.walk(choose, agent)
-    assert found.lost == 0 and found.won > 0
-
-
-@pytest.mark.parametrize("kind", SEARCHES)
-def test_values_are_the_movers_and_a_win_at_hand_is_taken(kind, perfect):
+def test_values_are_the_movers_and_a_win_at_hand_is_taken(kind):
     # X has two in a row; O too. Whoever moves wins at once, so both see 1.
     both = (0b000000011, 0b000011000)
     of_second = (0b100000011, 0b000011000)
     settings = SearchSettings(kind, 64)
-    found = search(TIC_TAC_TOE, perfect, settings, (), lines.batch([both, of_second]), KEY, explore=False)
+    found = search(TIC_TAC_TOE, lines.perfect_evaluation(), settings, (), lines.batch([both, of_second]), KEY, explore=False)
     assert found.action.tolist() == [2, 5]
     assert (found.value > 0.2).all()
 

@@ -17,6 +17,8 @@ from thorndike.games.settings import GameSettings
 from thorndike.games.tic_tac_toe import TIC_TAC_TOE
 from thorndike.replay.self_play import Rows, add_self_play, init_self_play, outcomes, sample_self_play
 
+pytestmark = pytest.mark.usefixtures("quick_compile")
+
 KEY = jax.random.key(0)
 STEPS, GAMES, LENGTH, LONGEST = 24, 3, 4, 9
 """The ring's steps, games side by side, steps written at once, the longest game."""
@@ -130,7 +132,8 @@ def test_an_equal_part_of_a_batch_is_turned_each_way_policy_and_board_together()
 
 def found(values: list[float]) -> Found:
     policy = jnp.tile(jnp.array([[0.7, 0.2, 0.1]]), (len(values), 1))
-    return Found(jnp.zeros((len(values),), jnp.int32), policy, jnp.array(values), (10 * policy).astype(jnp.int32))
+    action = jnp.zeros((len(values),), jnp.int32)
+    return Found(action, policy, jnp.array(values), (10 * policy).astype(jnp.int32), action[:, None])
 
 
 def test_the_first_moves_are_drawn_by_the_policy_and_the_later_ones_are_the_best():

@@ -13,7 +13,7 @@ from safetensors.numpy import load_file
 from language.make_reference import CASES, LORA, REFERENCE, SCORED
 from language.make_reference import GREEDY as GREEDY_TOKENS
 from thorndike.errors import UserError
-from thorndike.language.decoder import hidden_states, initial_params, logits, param_shapes, positions_in, token_log_probs
+from thorndike.language.decoder import hidden_states, initial_params, logits, param_shapes, positions_in, token_divergences, token_log_probs
 from thorndike.language.generation import GREEDY, generate
 from thorndike.language.lora import LoraConfig, initial_adapter, load_adapter, merged, save_adapter
 from thorndike.language.model import LanguageModel, load_decoder, load_model, save_model
@@ -113,6 +113,19 @@ def test_log_probabilities_are_those_of_the_whole_distribution(name: str, temper
     monkeypatch.setattr("thorndike.language.decoder._CHUNK", 7 * config.vocab_size)
     np.testing.assert_allclose(token_log_probs(params, config, hidden, tokens, temperature), wanted, atol=1e-5)
     np.testing.assert_allclose(jax.grad(total)(hidden), gradient, atol=1e-5)
+
+
+def test_the_divergence_of_two_models_is_the_sum_over_the_vocabulary(monkeypatch: pytest.MonkeyPatch) -> None:
+    config, params = load_decoder(REFERENCE / "llama")
+    other = jax.tree.map(lambda leaf: 0.9 * leaf, params)
+    tokens, segments = inputs()
+    hidden, theirs = (forward(each, config, tokens, segments) for each in (params, other))
+    p, q = (np.asarray(jax.nn.log_softmax(logits(each, config, x) / 0.7), np.float64) for each, x in ((params, hidden), (other, theirs)))
+    for chunk in (2**24, 7 * config.vocab_size):
+        monkeypatch.setattr("thorndike.language.decoder._CHUNK", chunk)
+        found = np.asarray(token_divergences(params, hidden, other, theirs, config, 0.7))
+        np.testing.assert_allclose(found, (np.exp(p) * (p - q)).sum(-1), atol=1e-5)
+        assert found.shape == tokens.shape and found.min() >= 0
 
 
 def test_recomputed_layers_have_the_same_gradient() -> None:

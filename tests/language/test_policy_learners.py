@@ -170,7 +170,7 @@ def test_a_policy_learns_what_is_rewarded(name, tmp_path):
     outcome = train_policy(
         Task(BASE, PROMPTS, by_token), LEARNERS[name](), loop_config(name), run, limits=FREE, told=lambda step, values: seen.append(values)
     )
-    assert outcome.iterations == 8 and outcome.stopped is None and outcome.kl > 0.05
+    assert outcome.iterations == 8 and outcome.finished and outcome.stopped is None and outcome.kl > 0.05
     assert all(values["train/first_ratio_error"] < 1e-4 and values["train/log_prob_gap"] < 1e-4 for values in seen)
     assert seen[0]["objective/kl"] == pytest.approx(0.0, abs=1e-5)
     assert np.mean([values["objective/score"] for values in seen[-3:]]) > np.mean([values["objective/score"] for values in seen[:2]])
@@ -188,7 +188,7 @@ def test_it_goes_on_bit_for_bit(tmp_path):
     learner = proximal.ppo(config, BASE.config, PARAMS)
     whole, cut = start(tmp_path, "whole"), start(tmp_path, "cut")
     straight = train_policy(task, learner, config, whole, limits=FREE)
-    train_policy(task, learner, config, cut, limits=FREE, until=3)
+    assert not train_policy(task, learner, config, cut, limits=FREE, until=3).finished
     resumed = train_policy(task, learner, config, cut, limits=FREE)
     assert numbers(whole) == numbers(cut)
     jax.tree.map(np.testing.assert_array_equal, straight.params, resumed.params)

@@ -10,11 +10,13 @@ import io
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Literal, NamedTuple, TypeAlias, cast
+from typing import Literal, NamedTuple, NoReturn, TypeAlias, cast
 
 from thorndike.errors import UserError
 from thorndike.language.tokenizer import Tokenizer
 from thorndike.training.json_files import Json, quoted
+
+_LONGEST_CELL = 2**31 - 1
 
 Format: TypeAlias = Literal["language_modelling", "prompt_completion", "preference", "judged", "prompt"]
 Conversation: TypeAlias = list[dict[str, object]]
@@ -176,12 +178,12 @@ def _json_lines(data: bytes, path: Path) -> list[Row]:
     rows = []
     for number, line in enumerate(data.split(b"\n"), 1):
         if line.strip():
-            rows.append(_row(_parsed(line, f"{path}, row {number}"), f"{path}, row {number}"))
+            rows.append(_row(parsed_json(line, f"{path}, row {number}"), f"{path}, row {number}"))
     return rows
 
 
 def _json_list(data: bytes, path: Path) -> list[Row]:
-    content = _parsed(data, str(path))
+    content = parsed_json(data, str(path))
     if not isinstance(content, list):
         raise UserError(f"{path}: expected a list of objects, got {quoted(content)}; one object a line goes into a .jsonl file")
     return [_row(each, f"{path}, row {number}") for number, each in enumerate(content, 1)]
@@ -193,9 +195,13 @@ def _csv_rows(data: bytes, path: Path) -> list[Row]:
     except UnicodeDecodeError as error:
         row = data[: error.start].count(b"\n") + 1
         raise UserError(f"{path}, row {row}: not UTF-8 (byte {error.start}); save the file as UTF-8") from None
-    reader = csv.DictReader(io.StringIO(text, newline=""))
-    rows = []
+    csv.field_size_limit(_LONGEST_CELL)
+    reader = csv.DictReader(io.StringIO(text, newline=""), strict=True)
+    rows: list[Row] = []
     try:
+        names = list(reader.fieldnames or ())
+        if len(set(names)) < len(names):
+            raise UserError(f"{path}: its first line names a column twice: {', '.join(map(quoted, names))}")
         for number, each in enumerate(reader, 1):
             if None in each or None in each.values():
                 raise UserError(f"{path}, row {number}: it has not as many cells as the first line has columns")
@@ -218,15 +224,27 @@ def _parquet_rows(data: bytes, path: Path) -> list[Row]:
     return [_row(each, f"{path}, row {number}") for number, each in enumerate(content, 1)]
 
 
-def _parsed(data: bytes, where: str) -> object:
+def parsed_json(data: bytes, where: str) -> object:
+    """What a JSON text holds. Raises ``UserError`` for one that is damaged, or of which something would be lost."""
     try:
-        return json.loads(data.decode("utf-8-sig"))
+        return json.loads(data.decode("utf-8-sig"), object_pairs_hook=_no_name_twice, parse_constant=_no_number)
     except UnicodeDecodeError as error:
         raise UserError(f"{where}: not UTF-8 (byte {error.start}); save the file as UTF-8") from None
     except RecursionError:
         raise UserError(f"{where}: nested too deeply") from None
     except ValueError as error:
         raise UserError(f"{where}: no JSON: {str(error)[:200]}") from None
+
+
+def _no_name_twice(pairs: list[tuple[str, object]]) -> Json:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        raise ValueError("an object has a name twice, and one of its values would be lost")
+    return found
+
+
+def _no_number(text: str) -> NoReturn:
+    raise ValueError(f"{text} is no number in JSON")
 
 
 def _row(content: object, where: str) -> Row:

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from thorndike.errors import UserError
+from thorndike.functional.policy_divergence import categorical_divergence
 from thorndike.language.model_config import ModelConfig
 from thorndike.language.rope import Rope, frequencies
 
@@ -172,6 +173,23 @@ def token_log_probs(
 
     flat = (hidden.reshape(-1, hidden.shape[-1]), targets.reshape(-1))
     return by_vocabulary(chosen, flat, config.vocab_size).reshape(targets.shape)
+
+
+def token_divergences(
+    params: Params,
+    hidden: Float[Array, "*rows d"],
+    reference: Params,
+    reference_hidden: Float[Array, "*rows d"],
+    config: ModelConfig,
+    temperature: float = 1.0,
+) -> Float[Array, "*rows"]:
+    """The exact divergence ``KL(model || reference)`` of the next token of each row, over the whole vocabulary; both have one config."""
+
+    def exact(rows: Array, others: Array) -> Array:
+        return categorical_divergence(logits(params, config, rows) / temperature, logits(reference, config, others) / temperature)
+
+    flat = tuple(each.reshape(-1, each.shape[-1]) for each in (hidden, reference_hidden))
+    return by_vocabulary(exact, flat, config.vocab_size).reshape(hidden.shape[:-1])
 
 
 def by_vocabulary(function: Callable[..., PyTree], rows: tuple[Array, ...], vocab_size: int) -> PyTree:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -21,23 +21,24 @@ from thorndike.language import grpo as groups
 from thorndike.language import ppo as proximal
 from thorndike.language.best_of_n import curve, sample_many
 from thorndike.language.comparisons import comparison_data
+from thorndike.language.corpus import MOVIE_REVIEWS, read_corpus
 from thorndike.language.decoder import Params
 from thorndike.language.demo_labels import as_comparisons, judge_pairs
 from thorndike.language.demo_reward import learn_from_ratings, rewards_of
 from thorndike.language.learner import State
-from thorndike.language.model import LanguageModel, save_model
+from thorndike.language.model import LanguageModel, load_model, save_model
 from thorndike.language.over_optimisation import Limits
 from thorndike.language.policy_training import Task, train_policy
+from thorndike.language.pretraining import base_model
 from thorndike.language.reward_files import RewardModel, load_reward_model, refuse_if_near_chance, save_reward_model
 from thorndike.language.rollouts import Prompts
-from thorndike.language.sentiment import Lexicon, Rated
+from thorndike.language.sentiment import Lexicon, Rated, have_reviews, read_lexicon, read_ratings
 from thorndike.language.text_run import MODEL, open_run
 from thorndike.language.tokenizer import Tokenizer
 from thorndike.language.win_rate import Comparison, compare_with_base
-from thorndike.settings import AtLeast, MoreThan, check
-from thorndike.training.run_directory import write_json
+from thorndike.settings import AtLeast, MoreThan, check, settings_of
+from thorndike.training.run_directory import read_lines, write_json
 
-LEARNERS = ("ppo", "grpo", "rloo", "dpo", "ppo_without_kl")
 PROMPT_LENGTH = 8
 
 
@@ -50,7 +51,7 @@ class Config:
     max_new_tokens: Annotated[int, AtLeast(2)] = 24  # tokens of a completion
     learning_rate: Annotated[float, MoreThan(0)] = 3e-4  # of the policies, falling to 0
     target_kl: Annotated[float, MoreThan(0)] = 6.0  # nats a text
-    reward_epochs: Annotated[int, AtLeast(1)] = 4  # passes over the ratings
+    reward_epochs: Annotated[int, AtLeast(1)] = 2  # passes over the ratings
     reward_members: Annotated[int, AtLeast(1)] = 2  # reward models whose mean is the reward
     pairs: Annotated[int, AtLeast(1)] = 3000  # of texts that the crowd judges
     held_out: Annotated[int, AtLeast(1)] = 512  # prompts that policy and base are compared on
@@ -73,14 +74,18 @@ Tell = Callable[[str], None]
 
 
 def review_prompts(texts: Sequence[str], tokenizer: Tokenizer, held_out: int) -> tuple[Prompts, Prompts]:
-    """The first tokens of windows of reviews that the base has not read; those for the comparison are of other reviews.
+    """The first tokens of windows, from a word on, of reviews that the base has not read; those to compare on are of other reviews.
 
     Raises ``UserError`` where there are too few.
     """
     found: dict[tuple[int, ...], int] = {}
+    begins = {token for token in range(tokenizer.vocab_size) if tokenizer.decode([token]).startswith(" ")}
     for review, tokens in enumerate(tokenizer.encode_many(texts)):
-        for start in range(0, len(tokens) - PROMPT_LENGTH + 1, 3 * PROMPT_LENGTH):
-            found.setdefault(tuple(tokens[start : start + PROMPT_LENGTH]), review)
+        last = -3 * PROMPT_LENGTH
+        for start in range(len(tokens) - PROMPT_LENGTH + 1):
+            if tokens[start] in begins and start >= last + 3 * PROMPT_LENGTH:
+                found.setdefault(tuple(tokens[start : start + PROMPT_LENGTH]), review)
+                last = start
     order = sorted(found, key=lambda window: found[window])
     if len(order) <= held_out:
         raise UserError(f"the held-out reviews give {len(order)} prompts; the demo needs more than {held_out}")
@@ -88,9 +93,21 @@ def review_prompts(texts: Sequence[str], tokenizer: Tokenizer, held_out: int) ->
     return (_as_prompts(parts[0], tokenizer), _as_prompts(parts[1], tokenizer))
 
 
+def demo(out: Path, base: Path | None, config: Config, learners: Sequence[str], seed: int, tell: Tell) -> dict[str, object]:
+    """Everything, from data that is fetched where it is missing, and a base that is made where none is given."""
+    have_reviews()
+    corpus = read_corpus(MOVIE_REVIEWS)
+    if base is None:
+        tell("the base model is made of film reviews, once")
+        base = base_model()
+    model = load_model(base)
+    train, held_out = review_prompts(corpus.held_out, model.tokenizer, config.held_out)
+    return run_demo(out, Data(model, train, held_out, read_ratings(), read_lexicon()), config, learners, seed, tell)
+
+
 def run_demo(out: Path, data: Data, config: Config, learners: Sequence[str], seed: int, tell: Tell) -> dict[str, object]:
     """All stages; what was found, as ``report.json`` holds it."""
-    open_run(out, {"verb": "demo", "seed": seed, "learners": list(learners), "settings": vars(config)})
+    open_run(out, {"verb": "demo", "seed": seed, "learners": list(learners), "settings": settings_of(config)})
     began = time.perf_counter()
     found: dict[str, object] = {"seed": seed}
     kept = Kept(out, tell)
@@ -191,18 +208,23 @@ def _by_rewards(
     else:
         of_groups = _group_settings(config, "group" if name == "grpo" else "leave_one_out")
         settings, learner = of_groups, groups.grpo(of_groups, base.config, base.params)
-    open_run(run, {"verb": name, "seed": seed, "settings": vars(settings)})
-    seen: list[dict[str, float]] = []
+    open_run(run, {"verb": name, "seed": seed, "settings": settings_of(settings)})
 
     def follow(step: int, values: dict[str, float]) -> None:
-        seen.append({"step": step} | {name: values[f"objective/{name}"] for name in ("score", "gold", "kl")})
         if step % 10 == 0:
             tell(f"{name}, step {step}: proxy {values['objective/score']:.2f}, gold {values['objective/gold']:.2f}, "
                  f"{values['objective/kl']:.1f} nats")  # fmt: skip
 
     task = Task(base, data.train, score, members if len(model.members) > 1 else None, {"gold": data.gold.score})
     outcome = train_policy(task, learner, settings, run, seed=seed, limits=limits, told=follow)
-    return outcome.params, {"iterations": outcome.iterations, "stopped": outcome.stopped, "kl_in_training": outcome.kl, "curve": seen}
+    if not outcome.finished:
+        raise UserError(f"interrupted after {outcome.iterations} iterations of {name}; the same command goes on from there")
+    return outcome.params, {
+        "iterations": outcome.iterations,
+        "stopped": outcome.stopped,
+        "kl_in_training": outcome.kl,
+        "curve": _curve(run),
+    }
 
 
 def _ppo_settings(config: Config, free: bool) -> proximal.Config:
@@ -235,6 +257,13 @@ def _group_settings(config: Config, baseline: str) -> groups.Config:
         kl_in="reward",
         target_kl=config.target_kl,
     )
+
+
+def _curve(run: Path) -> list[dict[str, float]]:
+    """Proxy, gold and divergence of every iteration, from the log: an interrupted run has them from its first one."""
+    rows = read_lines(run / "metrics.jsonl")
+    names = ("score", "gold", "kl")
+    return [{"step": float(str(row["steps"]))} | {name: cast(list[float], row[f"objective/{name}"])[0] for name in names} for row in rows]
 
 
 def _by_dpo(data: Data, config: Config, seed: int) -> Params:

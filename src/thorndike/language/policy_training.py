@@ -99,7 +99,9 @@ class Outcome(NamedTuple):
     kl: float
     """Of these parameters, nats a text, on the last texts that they wrote in training."""
     stopped: str | None
-    """Which limit ended the run, in words; None if it went to its end."""
+    """Which limit ended the run, in words; None if none did."""
+    finished: bool
+    """False where it was interrupted, or paused: called again, it goes on."""
 
 
 class Iteration(NamedTuple):
@@ -132,7 +134,7 @@ def train_policy(
         while iteration < config.total_steps:
             if iteration == until or interrupted() is not None:
                 save_progress(run, (state, kept, kept_kl), Progress(iteration, watch, _since(progress, began)))
-                return Outcome(kept, iteration, float(kept_kl), None)
+                return Outcome(kept, iteration, float(kept_kl), None, False)
             key_write, key_learn = jax.random.split(jax.random.fold_in(key, iteration))
             found = write(task, learner.params(state), config, learner.samples, key_write)
             watch = watched(watch, found.signals)
@@ -159,7 +161,7 @@ def train_policy(
     set_outcome(
         run, {"status": "finished" if stopped is None else "stopped", "iterations": iteration, "kl": float(kept_kl), "why": stopped}
     )
-    return Outcome(kept, iteration, float(kept_kl), stopped)
+    return Outcome(kept, iteration, float(kept_kl), stopped, True)
 
 
 def write(task: Task, params: Params, config: LoopConfig, samples: int, key: Key[Array, ""]) -> Iteration:

@@ -43,7 +43,7 @@ class Config:
     total_steps: Annotated[int, AtLeast(1)] = 900  # gradient steps
     batch_size: Annotated[int, AtLeast(1)] = 72  # rows of a gradient step
     max_length: Annotated[int, AtLeast(2)] = 64  # tokens of a row
-    learning_rate: Annotated[float | str, AtLeast(0)] = "cosine(4e-3, 4e-4)"  # AdamW's step size
+    learning_rate: Annotated[float | str, AtLeast(0)] = "cosine(2e-3, 2e-4)"  # AdamW's step size
     warmup_fraction: Annotated[float, Between(0, 1)] = 0.03
     weight_decay: Annotated[float, AtLeast(0)] = 0.1
 

@@ -20,6 +20,8 @@ from thorndike.language.preferences.store import Store
 
 STATIC = Path(__file__).parent / "static"
 _MOST_AT_ONCE = 20
+_LARGEST = 2**31 - 1
+"""Number of a row, in PostgreSQL."""
 _KINDS_OF_CLIPS = {".mp4": "video", ".webm": "video", ".gif": "image", ".png": "image", ".jpg": "image", ".jpeg": "image", ".webp": "image"}
 
 
@@ -44,7 +46,7 @@ class _Asking(BaseModel):
 class _Saying(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True)
     rater: Annotated[str, Field(max_length=200)]
-    assignment: int
+    assignment: Annotated[int, Field(ge=0, le=_LARGEST)]
     verdict: str
     request: str
     ranks: Annotated[list[int], Field(max_length=100)] | None = None
@@ -96,7 +98,7 @@ def add_label_page(app: FastAPI, labelling: Labelling) -> None:
 
     @app.get("/label/media/{assignment}/{place}")
     def media(assignment: int, place: int) -> Response:
-        shown = store.shown([assignment])
+        shown = store.shown([assignment] if 0 <= assignment <= _LARGEST else [])
         if not shown or not 0 <= place < len(shown[0].candidates):
             return Response(status_code=404)
         path = _clip(labelling.media, shown[0].candidates[place])

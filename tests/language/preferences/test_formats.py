@@ -56,20 +56,20 @@ def test_an_implicit_prompt_is_what_both_answers_begin_with():
 
 GOOD_ROW = EXAMPLES["preference", False]
 WRONG = {
-    "no JSON": ('{"prompt": ', "row 2 is damaged"),
-    "no object": ("[1, 2]", "row 2 is .* must be an object"),
+    "no JSON": ('{"prompt": ', "row 2: no JSON"),
+    "no object": ("[1, 2]", "row 2: expected an object"),
     "an unknown column": ('{"question": "a"}', "row 2 has the columns 'question'"),
     "an answer missing": ('{"prompt": "a", "chosen": null, "rejected": "b"}', "row 2"),
     "an empty answer": ('{"prompt": "a", "chosen": " ", "rejected": "b"}', "row 2: 'chosen' is empty"),
     "a number for an answer": ('{"prompt": "a", "chosen": 3, "rejected": "b"}', "row 2: 'chosen' is 3"),
     "answers that are the same": ('{"prompt": "a", "chosen": "b", "rejected": "b"}', "row 2: .* the same"),
-    "a name twice": ('{"prompt": "a", "prompt": "b", "chosen": "c", "rejected": "d"}', "row 2 .* twice"),
-    "half a character": ('{"prompt": "a", "chosen": "\\ud83d", "rejected": "d"}', "row 2 .* Unicode"),
-    "no number": ('{"prompt": "a", "chosen": "c", "rejected": "d", "weight": NaN}', "row 2 .* NaN"),
+    "a name twice": ('{"prompt": "a", "prompt": "b", "chosen": "c", "rejected": "d"}', "row 2: .* twice"),
+    "half a character": ('{"prompt": "a", "chosen": "\\ud83d", "rejected": "d"}', "row 2 holds half a character"),
+    "no number": ('{"prompt": "a", "chosen": "c", "rejected": "d", "weight": NaN}', "row 2: .* NaN"),
     "mixed forms": ('{"prompt": "a", "chosen": [{"role": "user", "content": "x"}], "rejected": "d"}', "row 2 mixes forms"),
     "a wrong message": ('{"prompt": "a", "chosen": [{"role": "user"}], "rejected": "d"}', "row 2: 'chosen', message 1"),
     "another format": ('{"prompt": "a", "completion": "b"}', "row 2 is standard prompt completion, but the rows before are standard pref"),
-    "deep nesting": ('{"prompt": ' + "[" * 100_000, "row 2 is nested too deeply"),
+    "deep nesting": ('{"prompt": ' + "[" * 100_000, "row 2: nested too deeply"),
 }
 
 
@@ -85,14 +85,14 @@ def test_what_is_wrong_is_named_by_file_and_row(name, tmp_path):
 @pytest.mark.parametrize(
     ("name", "content", "why"),
     [
-        ("x.jsonl", b'{"text": "a"}\n{"text": "\xff"}', "row 2 is not UTF-8"),
-        ("x.csv", b"text,n\na,1\n\xff,2\n", "line 3 is not UTF-8"),
-        ("x.csv", b"text,n\na,1\nb\n", "row 2 has 1 cells"),
+        ("x.jsonl", b'{"text": "a"}\n{"text": "\xff"}', "row 2: not UTF-8"),
+        ("x.csv", b"text,n\na,1\n\xff,2\n", "row 3: not UTF-8"),
+        ("x.csv", b"text,n\na,1\nb\n", "row 2: it has not as many cells"),
         ("x.csv", b"text,text\na,1\n", "names a column twice"),
-        ("x.csv", b'text,n\n"a,1\n', "row 1 is damaged"),
+        ("x.csv", b'text,n\n"a,1\n', "row 1: "),
         ("x.csv", b"prompt,completion,label\na,b,perhaps\n", "'label' is 'perhaps'"),
-        ("x.json", b'{"text": "a"}', "must hold a list"),
-        ("x.jsonl", b"\n\n", "holds no rows"),
+        ("x.json", b'{"text": "a"}', "expected a list"),
+        ("x.jsonl", b"\n\n", "no rows"),
         ("x.txt", b"a", "ends in"),
     ],
 )
@@ -117,10 +117,10 @@ def test_mutated_files_are_read_whole_or_refused_in_one_line(files, ending, tmp_
         write_records(path, examples[each % len(examples)])
         data = bytearray(path.read_bytes())
         for _ in range(draws.randint(1, 4)):
-            place = draws.randrange(len(data))
+            place = draws.randrange(len(data) or 1)
             match draws.randrange(4):
                 case 0:
-                    data[place] = draws.randrange(256)
+                    data[place : place + 1] = bytes([draws.randrange(256)])
                 case 1:
                     del data[place : place + draws.randint(1, 20)]
                 case 2:
@@ -145,8 +145,8 @@ def test_preferences_go_into_a_store_and_come_out_as_they_were(tmp_path):
     with Store(tmp_path / "x.db") as store:
         project = store.project("p")
         records = check_records(rows, "rows")
-        assert import_records(store, project, records, "file", Plan(share_to_more=0)) == (40, 40)
-        assert import_records(store, project, records, "file", Plan(share_to_more=0)) == (0, 0), "again adds nothing"
+        assert import_records(store, project, records, "file", Plan(share_to_more=0)) == (40, 40, 0)
+        assert import_records(store, project, records, "file", Plan(share_to_more=0)) == (0, 0, 0), "again adds nothing"
         out = export_rows(store, project)
         texts = [{name: row[name] for name in ("prompt", "chosen", "rejected")} for row in out]
         assert texts == [{name: row[name] for name in ("prompt", "chosen", "rejected")} for row in rows]
@@ -154,16 +154,16 @@ def test_preferences_go_into_a_store_and_come_out_as_they_were(tmp_path):
         write_records(tmp_path / "out.jsonl", out)
         other = store.project("other")
         again = import_records(store, other, read_records(tmp_path / "out.jsonl"), "file", Plan(share_to_more=0))
-        assert again == (40, 40) and len(export_rows(store, other)) == 40
+        assert again == (40, 40, 0) and len(export_rows(store, other)) == 40
 
 
 def test_a_wrong_row_adds_nothing(tmp_path):
     with Store(tmp_path / "x.db") as store:
         project = store.project("p")
         rows = [{"prompt": "p", "candidates": ["a", "b"]}, {"prompt": "q", "candidates": ["a", "b"], "best": 5}]
-        with pytest.raises(UserError, match="row 2: 'best'"):
+        with pytest.raises(UserError, match="rows, row 2: 'best'"):
             import_records(store, project, check_records(rows, "rows"), "file", Plan())
-        with pytest.raises(UserError, match="one completion"):
+        with pytest.raises(UserError, match="rows, row 1: its prompt has one completion"):
             import_records(store, project, check_records([{"prompt": "p", "completion": "a"}], "rows"), "file", Plan())
         with pytest.raises(UserError, match="nothing to compare"):
             import_records(store, project, check_records([{"prompt": "p"}], "rows"), "file", Plan())
@@ -174,7 +174,7 @@ def test_completions_of_a_prompt_become_one_item_and_clips_are_items_too(tmp_pat
     with Store(tmp_path / "x.db") as store:
         project = store.project("p")
         rows = [{"prompt": f"p{each % 2}", "completion": f"c{each}", "model": f"m{each}"} for each in range(6)]
-        assert import_records(store, project, check_records(rows, "rows"), "file", Plan()) == (2, 0)
+        assert import_records(store, project, check_records(rows, "rows"), "file", Plan()) == (2, 0, 0)
         clips = [
             {
                 "prompt": {"text": "Which one walks?"},
@@ -183,8 +183,16 @@ def test_completions_of_a_prompt_become_one_item_and_clips_are_items_too(tmp_pat
                 "best": 1,
             }
         ]
-        assert import_records(store, project, check_records(clips, "rows"), "file", Plan()) == (1, 0)
+        assert import_records(store, project, check_records(clips, "rows"), "file", Plan()) == (1, 0, 0)
         assert [(len(each.candidates), each.best) for each in store.questions(project).values()] == [(3, None), (3, None), (2, 1)]
+
+
+def test_samples_that_are_the_same_are_compared_once_or_left_out(tmp_path):
+    with Store(tmp_path / "x.db") as store:
+        project = store.project("p")
+        rows = [{"prompt": "p", "completions": ["a", "a", "b"], "best": 2}, {"prompt": "q", "completions": ["a", "a"]}]
+        assert import_records(store, project, check_records(rows, "rows"), "file", Plan()) == (1, 0, 1)
+        assert [(len(each.candidates), each.best) for each in store.questions(project).values()] == [(2, 1)]
 
 
 @pytest.fixture(scope="module")

@@ -3,11 +3,21 @@
 import numpy as np
 import pytest
 
-from language.preferences.made_up_crowd import accuracy, crowd_labels
 from thorndike.errors import UserError
 from thorndike.language.preferences.comparisons import Comparisons, Pair
 from thorndike.language.preferences.noise import believe, davidson, dawid_skene, majority, mean_labels
-from thorndike.language.preferences.raters import Rater
+from thorndike.language.preferences.raters import Rater, crowd, crowd_comparisons
+
+
+def crowd_labels(seed, pairs=2_000, labels=3, raters=None):
+    """Comparisons of pairs by a random few of the crowd each, and whether the first of each pair is better."""
+    utilities = np.random.default_rng(seed).normal(size=(pairs, 2))
+    return crowd_comparisons(utilities, crowd() if raters is None else raters, labels, seed), utilities[:, 0] > utilities[:, 1]
+
+
+def accuracy(first_is_better, truth):
+    """Of labels; a half for each that says nothing."""
+    return float(np.where(first_is_better == 0.5, 0.5, (first_is_better > 0.5) == truth).mean())
 
 
 def single_labels(comparisons):
@@ -83,7 +93,7 @@ def test_an_unknown_method_and_a_prior_that_means_ill_are_refused():
 
 def test_davidson_finds_strengths_and_ties():
     generator = np.random.default_rng(0)
-    strengths, nu, games = np.array([-1.0, 0.0, 0.3, 0.7]), 0.8, 40_000
+    strengths, nu, games = np.array([-1.0, 0.0, 0.3, 0.7]), 0.8, 10_000
     p = np.exp(strengths)
     pairs = [(i, j) for i in range(4) for j in range(i + 1, 4)]
     which = generator.integers(len(pairs), size=games)
@@ -94,8 +104,8 @@ def test_davidson_finds_strengths_and_ties():
     value = np.where(u < p[first] / total, 1.0, np.where(u < (p[first] + tie) / total, 0.5, 0.0))
     numbered = tuple(Pair(each, 0, *pair) for each, pair in enumerate(pairs))
     found = davidson(Comparisons(numbered, ("anna",), which, np.zeros(games, np.int64), value, np.ones(games)))
-    np.testing.assert_allclose([found.strengths[each] for each in range(4)], strengths, atol=0.05)
-    assert abs(found.tie - nu) < 0.05
+    np.testing.assert_allclose([found.strengths[each] for each in range(4)], strengths, atol=0.1)
+    assert abs(found.tie - nu) < 0.1
 
 
 def test_one_that_never_lost_is_not_infinitely_strong():

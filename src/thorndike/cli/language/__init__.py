@@ -17,6 +17,13 @@ LANGUAGE_VERBS = {
     "label": "a page on which people say which answer, or which clip, is better",
     "agree": "how far raters agree, and how far each can be trusted",
     "export": "a store's preferences as a file that TRL's trainers read",
+    "reward": "a reward model from preferences, and how far it can be trusted",
+    "ppo": "PPO towards a reward, held close to the base",
+    "grpo": "GRPO: several completions of a prompt as each other's baseline",
+    "rloo": "REINFORCE, the other completions of a prompt as the baseline",
+    "dpo": "a policy from preferences, without a reward model",
+    "eval": "a policy beside its base: win rate, divergence, drift",
+    "demo": "all of it on a small model, with a report",
 }
 """Verb -> its line in the help; each is a file beside this one."""
 
@@ -25,6 +32,7 @@ EXAMPLES = """\
   thorndike language generate runs/base/model --prompt "The film was" --samples 4
   thorndike language sft runs/base/model --data answers.jsonl --out runs/tuned
   thorndike language chat runs/tuned/model
+  thorndike language demo --out runs/demo
   thorndike language label --db prefs.db
 `thorndike language VERB --help` tells more."""
 

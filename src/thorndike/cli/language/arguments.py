@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TypeVar
 
-from thorndike.cli.parser import Parser
+from thorndike.cli.parser import Parser, positive_whole
 from thorndike.config_fields import fields_in_source
 from thorndike.errors import UserError
 from thorndike.settings import FieldFacts, describe_kind, parse_settings
@@ -37,7 +37,7 @@ def add_sampling_arguments(parser: Parser, new_tokens: int) -> None:
     parser.add_argument(
         "--top-p", type=_at_least_zero, default=1.0, metavar="P", help="among the likeliest that make up P together (default: 1)"
     )
-    parser.add_argument("--max-new-tokens", type=int, default=new_tokens, metavar="N", help=f"at most (default: {new_tokens})")
+    parser.add_argument("--max-new-tokens", type=positive_whole, default=new_tokens, metavar="N", help=f"at most (default: {new_tokens})")
 
 
 def add_settings_argument(parser: Parser) -> None:

@@ -40,8 +40,9 @@ def run(words: Sequence[str]) -> Answer:
         project = store.project(options.project, guidelines)
         added = import_records(store, project, records, options.rater, plan, ask=options.ask)
     data = {"store": options.db, "project": options.project, "format": records.format, "rows": len(records.rows)}
-    data |= {"items": added.items, "judgements": added.judgements}
-    known = "" if added.items else "; all of them were there already"
+    data |= {"items": added.items, "judgements": added.judgements, "left_out": added.left_out}
+    known = f"; {added.left_out:,} left out, whose candidates are all the same" if added.left_out else ""
+    known += "" if added.items or added.left_out else "; all of them were there already"
     rows = f"{len(records.rows):,} rows ({records.format.replace('_', ' ')})"
     text = f"{rows}: {added.items:,} new items, {added.judgements:,} judgements{known}"
     return Answer(data, f"{text}\nnext: thorndike language label --db {options.db}")

@@ -1,7 +1,8 @@
 """``thorndike language label``: the page on which people say which answer, or which clip, is better."""
 
+import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -10,12 +11,14 @@ from thorndike.cli.language.preference_store import add_store_arguments, existin
 from thorndike.cli.parser import Parser, seed_number
 from thorndike.cli.studio import port_number
 from thorndike.errors import UserError
+from thorndike.user_code import attribute_in_file, load_file, one_line
 
 PORT = 8430
 EXAMPLES = """\
   thorndike language label --db prefs.db
   thorndike language label --db prefs.db --host 192.168.1.20      raters on other machines of your network
-  thorndike language label --db clips.db --media runs/clips       two films side by side"""
+  thorndike language label --db clips.db --media runs/clips       two films side by side
+  thorndike language label --db prefs.db --simulate taste.py:worth     worth(prompt, candidate) -> how good it is"""
 
 
 def run(words: Sequence[str]) -> Answer:
@@ -29,7 +32,11 @@ def run(words: Sequence[str]) -> Answer:
     parser.add_argument("--gold", type=share, default=0.05, metavar="SHARE", help="of gold questions, if there are any (default: 0.05)")
     parser.add_argument("--repeats", type=share, default=0.03, metavar="SHARE", help="of items that are asked again (default: 0.03)")
     parser.add_argument("--seed", type=seed_number, default=0, help="what sides and draws follow from (default: 0)")
+    simulate_help = "no page: a simulated crowd (8 fair, 3 who guess, 1 the wrong way round) judges by a function of prompt and candidate"
+    parser.add_argument("--simulate", metavar="FILE.py:FUNCTION", help=simulate_help)
     options = parser.parse(words)
+    if options.simulate is not None:
+        return _simulate(options.db, options.project, options.simulate, (options.gold, options.repeats, options.seed))
     if find_spec("nicegui") is None:
         raise UserError("the page needs what the studio needs, which is not installed: pip install 'thorndike[web]'")
     media = options.media if options.media is not None else Path("." if "://" in options.db else Path(options.db).parent)
@@ -53,3 +60,34 @@ def run(words: Sequence[str]) -> Answer:
         serve_labelling(labelling, options.host, options.port, told)
         progress = store.progress(labelling.project)
     return Answer({"status": "ended", "judgements": progress.judgements, "done": progress.done, "items": progress.items}, "")
+
+
+def _simulate(where: str, project: str, name: str, shares: tuple[float, float, int]) -> Answer:
+    """Let the crowd judge all that is left."""
+    found = attribute_in_file(name)
+    if found is None:
+        raise UserError(f"--simulate is '{name}', but it must be path/to/file.py:function")
+    utility = getattr(load_file(found[0], found[1]), found[1], None)
+    if not callable(utility):
+        raise UserError(f"{found[0]} defines no function {found[1]}")
+
+    def checked(prompt: Mapping[str, object], candidate: Mapping[str, object]) -> float:
+        try:
+            worth = float(utility(prompt, candidate))
+        except Exception as error:
+            raise UserError(f"{name} failed: {type(error).__name__}: {one_line(error)}") from error
+        if not math.isfinite(worth):
+            raise UserError(f"{name} returned {worth}, but what a candidate is worth must be a finite number")
+        return worth
+
+    with opened_store(where) as store:
+        from thorndike.language.preferences.assignment import Plan
+        from thorndike.language.preferences.raters import crowd, let_them_judge
+
+        number = existing_project(store, project)
+        gold, repeats, seed = shares
+        made = let_them_judge(store, number, crowd(), checked, plan=Plan(gold=gold, repeats=repeats, seed=seed), seed=seed)
+        progress = store.progress(number)
+    data = {"status": "simulated", "made": made, "judgements": progress.judgements, "done": progress.done, "items": progress.items}
+    text = f"{made:,} judgements made, {progress.done:,} of {progress.items:,} items done"
+    return Answer(data, f"{text}\nnext: thorndike language agree --db {where}")

@@ -1,7 +1,7 @@
 """A store's content as rows of TRL's formats, and back."""
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 from thorndike.errors import UserError
@@ -9,8 +9,9 @@ from thorndike.language.preferences.assignment import Plan, with_raters
 from thorndike.language.preferences.comparisons import compared
 from thorndike.language.preferences.judgements import Candidate, Content, Judged, NewItem
 from thorndike.language.preferences.noise import Method, believe
-from thorndike.language.preferences.records import Records, Row, with_explicit_prompt
+from thorndike.language.preferences.records import Records, with_explicit_prompt
 from thorndike.language.preferences.store import Store
+from thorndike.training.json_files import Json
 
 EXPORTS = ("preference", "implicit", "unpaired", "prompt_only", "prompt_completion", "judgements")
 TIES = ("drop", "half")
@@ -21,6 +22,8 @@ class Imported(NamedTuple):
 
     items: int
     judgements: int
+    left_out: int = 0
+    """Rows whose candidates are all the same, as samples of a model may be: there is nothing to compare."""
 
 
 def import_records(store: Store, project: int, records: Records, rater: str, plan: Plan, *, ask: bool = False) -> Imported:
@@ -35,15 +38,17 @@ def import_records(store: Store, project: int, records: Records, rater: str, pla
             return Imported(store.add_items(project, items), 0)
         return Imported(*store.add_judged(project, store.rater(rater), [(item, [0, 1]) for item in items]))
     if records.format in ("candidates", "completions"):
-        rows: Iterable[NewItem] = [_item(row, records.format, number) for row, number in zip(records.rows, records.numbers, strict=True)]
+        found = [_item(row, records.format, place) for row, place in zip(records.rows, records.places, strict=True)]
     elif records.format in ("prompt_completion", "unpaired_preference"):
-        rows = _together(records)
+        found = list(_together(records))
     else:
-        raise UserError(f"rows of the format {records.format.replace('_', ' ')} hold nothing to compare: generate candidates first")
-    return Imported(store.add_items(project, with_raters(rows, plan)), 0)
+        known = records.format.replace("_", " ")
+        raise UserError(f"{records.where}: rows of the format {known} hold nothing to compare: generate candidates first")
+    items = [item for item in found if len(item.candidates) > 1]
+    return Imported(store.add_items(project, with_raters(items, plan)), 0, len(found) - len(items))
 
 
-def export_rows(store: Store, project: int, what: str = "preference", method: Method = "dawid_skene", ties: str = "drop") -> list[Row]:
+def export_rows(store: Store, project: int, what: str = "preference", method: Method = "dawid_skene", ties: str = "drop") -> list[Json]:
     """Rows of one of ``EXPORTS``. ``ties``: left out, or ``half``: two rows, one each way, of half the weight."""
     if what not in EXPORTS:
         raise UserError(f"there is no export called '{what}'; there are {', '.join(EXPORTS)}")
@@ -72,37 +77,42 @@ def _pair(row: Mapping[str, object]) -> NewItem:
     return NewItem(_content(row["prompt"]), (chosen, rejected))
 
 
-def _item(row: Mapping[str, object], column: str, number: int) -> NewItem:
+def _item(row: Mapping[str, object], column: str, place: str) -> NewItem:
     given, models, best, priority = row[column], row.get("models"), row.get("best"), row.get("priority", 0)
     assert isinstance(given, list)
-    if models is not None and not (
-        isinstance(models, list) and len(models) == len(given) and all(isinstance(each, str) for each in models)
-    ):
-        raise UserError(f"row {number}: 'models' must be a list of {len(given)} names, one a candidate")
+    named = models is None or (isinstance(models, list) and len(models) == len(given) and all(isinstance(each, str) for each in models))
+    if not named:
+        raise UserError(f"{place}: 'models' must be a list of {len(given)} names, one a candidate")
     if best is not None and not (type(best) is int and 0 <= best < len(given)):
-        raise UserError(f"row {number}: 'best' must be the place of a candidate, from 0 to {len(given) - 1}")
+        raise UserError(f"{place}: 'best' must be the place of a candidate, from 0 to {len(given) - 1}")
     if isinstance(priority, bool) or not isinstance(priority, int | float):
-        raise UserError(f"row {number}: 'priority' must be a number")
-    candidates = [
-        Candidate(_content(each), model)
-        for each, model in zip(given, models if isinstance(models, list) else [""] * len(given), strict=True)
-    ]
-    return NewItem(_content(row["prompt"]), candidates, priority=float(priority), best=best)
+        raise UserError(f"{place}: 'priority' must be a number")
+    makers = models if isinstance(models, list) else [""] * len(given)
+    candidates: list[Candidate] = []
+    for each, maker in zip(given, makers, strict=True):
+        _add_if_new(candidates, Candidate(_content(each), maker))
+    known = None if best is None else candidates.index(Candidate(_content(given[best]), makers[best]))
+    return NewItem(_content(row["prompt"]), candidates, priority=float(priority), best=known)
 
 
 def _together(records: Records) -> Iterator[NewItem]:
     """One item a prompt."""
-    found: dict[str, tuple[Content, list[Candidate], int]] = {}
-    for row, number in zip(records.rows, records.numbers, strict=True):
-        _, candidates, _ = found.setdefault(repr(row["prompt"]), (_content(row["prompt"]), [], number))
+    found: dict[str, tuple[Content, list[Candidate], list[str]]] = {}
+    for row, place in zip(records.rows, records.places, strict=True):
+        _, candidates, places = found.setdefault(repr(row["prompt"]), (_content(row["prompt"]), [], []))
         details = {name: value for name, value in row.items() if name not in ("prompt", "completion")}
-        made = Candidate(_content(row["completion"]), str(row.get("model", "")), details)
-        if all((each.content, each.made_by) != (made.content, made.made_by) for each in candidates):
-            candidates.append(made)
-    for prompt, candidates, number in found.values():
-        if len(candidates) < 2:
-            raise UserError(f"row {number}: its prompt has one completion, but at least 2 can be compared")
+        _add_if_new(candidates, Candidate(_content(row["completion"]), str(row.get("model", "")), details))
+        places.append(place)
+    for prompt, candidates, places in found.values():
+        if len(places) < 2:
+            raise UserError(f"{places[0]}: its prompt has one completion, but at least 2 can be compared")
         yield NewItem(prompt, candidates)
+
+
+def _add_if_new(candidates: list[Candidate], made: Candidate) -> None:
+    """A candidate that the same maker made twice is shown once."""
+    if all((each.content, each.made_by) != (made.content, made.made_by) for each in candidates):
+        candidates.append(made)
 
 
 def _content(value: object) -> Content:
@@ -124,7 +134,7 @@ def _answer(prompt: Content, candidate: Content) -> object:
 
 def _pairs(
     judged: Sequence[Judged], prompts: Mapping[int, Content], candidates: Mapping[int, Candidate], method: Method, ties: str
-) -> Iterator[Row]:
+) -> Iterator[Json]:
     comparisons = compared(judged)
     believed = believe(comparisons, method).first_is_better
     votes: dict[int, list[tuple[str, float, float]]] = defaultdict(list)
@@ -156,7 +166,7 @@ def _pairs(
             }
 
 
-def _implicit(row: Row) -> Row:
+def _implicit(row: Json) -> Json:
     prompt, chosen, rejected = row["prompt"], row["chosen"], row["rejected"]
     rest = {name: value for name, value in row.items() if name not in ("prompt", "chosen", "rejected")}
     if isinstance(prompt, str) and isinstance(chosen, str) and isinstance(rejected, str):
@@ -167,8 +177,8 @@ def _implicit(row: Row) -> Row:
 
 
 def _unpaired(
-    judged: Sequence[Judged], prompts: Mapping[int, Content], candidates: Mapping[int, Candidate], pairs: Sequence[Row]
-) -> Iterator[Row]:
+    judged: Sequence[Judged], prompts: Mapping[int, Content], candidates: Mapping[int, Candidate], pairs: Sequence[Json]
+) -> Iterator[Json]:
     """Good: who was preferred; bad: who was not, and those of which a rater said that both are bad."""
     for row in pairs:
         if not row["tie"]:
@@ -188,9 +198,9 @@ def _unpaired(
                 }
 
 
-def _best(pairs: Sequence[Row]) -> Iterator[Row]:
+def _best(pairs: Sequence[Json]) -> Iterator[Json]:
     """Of every prompt, the completion that won most: what to fine-tune on."""
-    won: dict[object, dict[str, tuple[float, Row]]] = defaultdict(dict)
+    won: dict[object, dict[str, tuple[float, Json]]] = defaultdict(dict)
     for row in pairs:
         for side, score in (("chosen", row["p_chosen"]), ("rejected", 0.0)):
             assert isinstance(score, float)
@@ -201,7 +211,7 @@ def _best(pairs: Sequence[Row]) -> Iterator[Row]:
         yield {**best, "prompt_id": number}
 
 
-def _judgement(each: Judged, prompts: Mapping[int, Content], candidates: Mapping[int, Candidate]) -> Row:
+def _judgement(each: Judged, prompts: Mapping[int, Content], candidates: Mapping[int, Candidate]) -> Json:
     made = [candidates[number] for number in each.candidates]
     return {
         "prompt": _plain(prompts[each.prompt]),

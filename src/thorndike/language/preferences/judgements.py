@@ -87,8 +87,10 @@ def check_response(response: Response) -> None:
     """Raises ``UserError`` for what no rater can have said."""
     if response.verdict not in VERDICTS:
         raise UserError(f"the verdict is {quoted(response.verdict)}, but it must be one of {', '.join(VERDICTS)}")
-    if not 0 < len(response.request) <= 100:
-        raise UserError(f"the request is {quoted(response.request)}, but it must be a name of 1 to 100 characters")
+    if not 0 < len(response.request) <= 100 or not response.request.isprintable():
+        raise UserError(f"the request is {quoted(response.request)}, but it must be a name of 1 to 100 printable characters")
+    if not response.client.isprintable():
+        raise UserError(f"the client is {quoted(response.client)}, but it must be printable")
     if response.strength is not None and response.strength not in STRENGTHS:
         raise UserError(f"the strength is {quoted(response.strength)}, but it must be 1 (slightly), 2 (clearly) or 3 (much)")
     if len(response.reason) > _LONGEST_REASON:

@@ -6,7 +6,10 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 from uuid import uuid4
 
+import numpy as np
+
 from thorndike.language.preferences.assignment import DEFAULT_PLAN, Plan, next_assignments
+from thorndike.language.preferences.comparisons import Comparisons, Floats, Pair
 from thorndike.language.preferences.judgements import Content, Response, Shown
 from thorndike.language.preferences.store import Store
 
@@ -54,6 +57,22 @@ def choose(rater: Rater, utilities: Sequence[float], draws: random.Random) -> tu
     for rank, place in enumerate(order):
         ranks[place] = rank
     return "ranking", ranks
+
+
+def crowd_comparisons(utilities: Floats, raters: Sequence[Rater], labels: int, seed: int = 0) -> Comparisons:
+    """What a random few of the crowd say of pairs of known utilities ``[pairs, 2]``, ``labels`` of them each; without a store."""
+    generator, draws = np.random.default_rng(seed), random.Random(f"crowd {seed}")
+    rows = []
+    for pair, (first, second) in enumerate(utilities.tolist()):
+        for rater in generator.choice(len(raters), labels, replace=False).tolist():
+            swapped = draws.random() < 0.5
+            said, _ = choose(raters[rater], (second, first) if swapped else (first, second), draws)
+            value = {"a": 1.0, "b": 0.0, "tie": 0.5}[said]
+            rows.append((pair, rater, 1 - value if swapped else value))
+    table = np.array(rows, np.float64).reshape(-1, 3)
+    pairs = tuple(Pair(each, each, 2 * each, 2 * each + 1) for each in range(len(utilities)))
+    numbers = table[:, :2].astype(np.int64)
+    return Comparisons(pairs, tuple(each.name for each in raters), numbers[:, 0], numbers[:, 1], table[:, 2], np.ones(len(table)))
 
 
 def let_them_judge(

@@ -9,12 +9,11 @@ import json
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple, NoReturn, TypeAlias
+from typing import NamedTuple
 
 from thorndike.errors import UserError
-from thorndike.training.json_files import quoted
-
-Row: TypeAlias = dict[str, object]
+from thorndike.language.data import Row, parsed_json, read_rows
+from thorndike.training.json_files import Json, quoted
 
 FORMATS: dict[str, tuple[str, ...]] = {
     "preference": ("chosen", "rejected"),
@@ -30,7 +29,6 @@ ENDINGS = (".jsonl", ".json", ".csv")
 
 _ANSWERS = ("chosen", "rejected", "completion", "text", "messages")
 _DEEPEST = 60
-_LARGEST_CELL = 2**31 - 1
 
 
 class Records(NamedTuple):
@@ -39,43 +37,39 @@ class Records(NamedTuple):
     format: str
     conversational: bool
     """Whether texts are lists of messages."""
-    rows: list[Row]
-    numbers: list[int]
-    """Where each row stands in the file: its line of JSON lines, else its place from 1, the heading of a CSV not counted."""
+    rows: list[Json]
+    places: list[str]
+    """Of each row: the file and its number, as messages have them."""
+    where: str
+    """The file."""
 
 
 def read_records(path: str | Path) -> Records:
     """The rows of a file, its format told by its columns. Raises ``UserError``, one line that names file and row."""
     path = Path(path)
-    if path.suffix.lower() not in ENDINGS:
-        raise UserError(f"{path}: expected a file that ends in {', '.join(ENDINGS)}")
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise UserError(f"{path} cannot be read: {error.strerror}") from error
-    reader = {".jsonl": _json_lines, ".json": _json_list, ".csv": _csv_rows}[path.suffix.lower()]
-    numbered = reader(content, path)
-    if not numbered:
-        raise UserError(f"{path} holds no rows")
-    return check_records([row for _, row in numbered], path, [number for number, _ in numbered])
+    rows = read_rows(path)
+    if path.suffix == ".csv":
+        rows = [Row({name: _cell(name, cell, row.where) for name, cell in row.content.items()}, row.where) for row in rows]
+    return _checked(rows, str(path))
 
 
-def check_records(rows: Sequence[Mapping[str, object]], where: str | Path, numbers: Sequence[int] | None = None) -> Records:
+def check_records(rows: Sequence[Mapping[str, object]], where: str) -> Records:
     """Rows that are in memory, checked like those of a file: all of one format, nothing empty."""
-    numbers = list(range(1, len(rows) + 1)) if numbers is None else list(numbers)
-    checked: list[Row] = []
+    return _checked([Row(dict(row), f"{where}, row {number}") for number, row in enumerate(rows, start=1)], where)
+
+
+def _checked(rows: Sequence[Row], where: str) -> Records:
     known: tuple[str, bool] | None = None
-    for number, row in zip(numbers, rows, strict=True):
-        place = f"{where}, row {number}"
+    for row, place in rows:
+        _check_text(row, place, _DEEPEST)
         kind = _format_of(row, place)
         found = kind, _check_row(kind, row, place)
         if known is not None and found != known:
             raise UserError(f"{place} is {_words(found)}, but the rows before are {_words(known)}: keep them in files of their own")
         known = found
-        checked.append(dict(row))
     if known is None:
         raise UserError(f"{where} holds no rows")
-    return Records(*known, checked, numbers)
+    return Records(*known, [dict(row.content) for row in rows], [row.where for row in rows], where)
 
 
 def write_records(path: str | Path, rows: Iterable[Mapping[str, object]]) -> int:
@@ -99,7 +93,7 @@ def write_records(path: str | Path, rows: Iterable[Mapping[str, object]]) -> int
     return len(written)
 
 
-def as_text(rows: Sequence[Row], ending: str, where: str | Path) -> str:
+def as_text(rows: Sequence[Json], ending: str, where: str | Path) -> str:
     """Rows in the form that an ending of ``ENDINGS`` tells."""
     match ending:
         case ".jsonl":
@@ -111,19 +105,22 @@ def as_text(rows: Sequence[Row], ending: str, where: str | Path) -> str:
     raise UserError(f"{where}: expected a file that ends in {', '.join(ENDINGS)}")
 
 
-def with_explicit_prompt(row: Mapping[str, object]) -> Row:
+def with_explicit_prompt(row: Mapping[str, object]) -> Json:
     """A preference whose prompt stands at the beginning of both answers, with the prompt on its own; another row as it is.
 
-    What both begin with: messages that are equal, or characters, without the space at the end, as TRL's ``extract_prompt`` has it.
+    What both begin with: messages that are equal, or characters, without the space at the end, as TRL's ``extract_prompt`` has it; but
+    where nothing is in common all stays an answer: TRL's cuts off the rest of one that ends in a space.
     """
     if "prompt" in row or not {"chosen", "rejected"} <= row.keys():
         return dict(row)
     chosen, rejected = row["chosen"], row["rejected"]
     assert isinstance(chosen, str | list) and isinstance(rejected, str | list)
     shorter = min(len(chosen), len(rejected))
-    # Where one begins with all of the other, the last part stays an answer: no answer is empty.
-    common = next((place for place in range(shorter) if chosen[place] != rejected[place]), shorter - 1)
-    if common > 0 and chosen[common - 1] == " ":
+    common = next((place for place in range(shorter) if chosen[place] != rejected[place]), None)
+    if common is None:
+        # One begins with all of the other: its last part stays an answer, so that none is empty.
+        common = shorter - 1
+    elif common > 0 and chosen[common - 1] == " ":
         common -= 1
     return {"prompt": chosen[:common], **row, "chosen": chosen[common:], "rejected": rejected[common:]}
 
@@ -194,57 +191,16 @@ def _is_messages(value: object, place: str, must_not_be_empty: bool) -> bool:
     return True
 
 
-def _json_lines(content: bytes, path: Path) -> list[tuple[int, Row]]:
-    rows = []
-    for number, line in enumerate(content.removeprefix(b"\xef\xbb\xbf").split(b"\n"), start=1):
-        if line.strip():
-            rows.append((number, _as_row(_parse(line, f"{path}, row {number}"), f"{path}, row {number}")))
-    return rows
-
-
-def _json_list(content: bytes, path: Path) -> list[tuple[int, Row]]:
-    parsed = _parse(content.removeprefix(b"\xef\xbb\xbf"), str(path))
-    if not isinstance(parsed, list):
-        raise UserError(f"{path} holds {quoted(parsed)}, but it must hold a list of objects; one object a line goes into a .jsonl file")
-    return [(number, _as_row(each, f"{path}, row {number}")) for number, each in enumerate(parsed, start=1)]
-
-
-def _csv_rows(content: bytes, path: Path) -> list[tuple[int, Row]]:
-    lines = content.removeprefix(b"\xef\xbb\xbf")
-    try:
-        text = lines.decode()
-    except UnicodeDecodeError as error:
-        line = lines.count(b"\n", 0, error.start) + 1
-        raise UserError(f"{path}, line {line} is not UTF-8 text") from error
-    csv.field_size_limit(_LARGEST_CELL)
-    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
-    rows: list[tuple[int, Row]] = []
-    heading: list[str] | None = None
-    try:
-        for cells in reader:
-            if heading is None:
-                heading = cells
-                if len(set(heading)) < len(heading):
-                    raise UserError(f"{path}: its heading names a column twice: {', '.join(map(quoted, heading))}")
-            elif cells:
-                place = f"{path}, row {len(rows) + 1}"
-                if len(cells) != len(heading):
-                    raise UserError(f"{place} has {len(cells)} cells, but the heading has {len(heading)}")
-                rows.append((len(rows) + 1, {name: _cell(name, cell, place) for name, cell in zip(heading, cells, strict=True)}))
-    except csv.Error as error:
-        raise UserError(f"{path}, row {len(rows) + 1} is damaged: {error}") from error
-    return rows
-
-
-def _cell(column: str, text: str, place: str) -> object:
+def _cell(column: str, text: object, place: str) -> object:
+    assert isinstance(text, str)
     if column == "label":
         return {"true": True, "false": False, "1": True, "0": False}.get(text.strip().lower(), text)
     if text.startswith(("[{", '["', '{"')):
-        return _parse(text.encode(), f"{place}: '{column}'")
+        return parsed_json(text.encode(), f"{place}: '{column}'")
     return text
 
 
-def _as_csv(rows: Sequence[Row]) -> str:
+def _as_csv(rows: Sequence[Json]) -> str:
     heading = list(dict.fromkeys(name for row in rows for name in row))
     out = io.StringIO(newline="")
     writer = csv.writer(out)
@@ -255,51 +211,17 @@ def _as_csv(rows: Sequence[Row]) -> str:
     return out.getvalue()
 
 
-def _parse(data: bytes, place: str) -> object:
-    try:
-        text = data.decode()
-    except UnicodeDecodeError as error:
-        raise UserError(f"{place} is not UTF-8 text, at byte {error.start + 1}") from error
-    try:
-        parsed = json.loads(text, object_pairs_hook=_no_name_twice, parse_constant=_no_number)
-        _check_text(parsed, _DEEPEST)
-    except RecursionError:
-        raise UserError(f"{place} is nested too deeply") from None
-    except ValueError as error:
-        raise UserError(f"{place} is damaged: {str(error)[:200]}") from None
-    return parsed
-
-
-def _no_name_twice(pairs: list[tuple[str, object]]) -> Row:
-    found = dict(pairs)
-    if len(found) < len(pairs):
-        raise ValueError("a name is there twice, of which one value would be lost")
-    return found
-
-
-def _no_number(text: str) -> NoReturn:
-    raise ValueError(f"{text} is not a number in JSON")
-
-
-def _check_text(value: object, depth: int) -> None:
-    """Escapes can write halves of characters that no file can hold."""
+def _check_text(value: object, place: str, depth: int) -> None:
+    """Raises for what no file or database can hold: halves of characters, which escapes can write, and endless nesting."""
     if depth == 0:
-        raise RecursionError
+        raise UserError(f"{place} is nested too deeply")
     if isinstance(value, str):
-        try:
-            value.encode()
-        except UnicodeEncodeError:
-            raise ValueError("a text is not valid Unicode") from None
+        if any("\ud800" <= each <= "\udfff" for each in value):
+            raise UserError(f"{place} holds half a character (a lone surrogate): mend its encoding")
     elif isinstance(value, list):
         for part in value:
-            _check_text(part, depth - 1)
+            _check_text(part, place, depth - 1)
     elif isinstance(value, dict):
         for name, part in value.items():
-            _check_text(name, 1)
-            _check_text(part, depth - 1)
-
-
-def _as_row(value: object, place: str) -> Row:
-    if not isinstance(value, dict):
-        raise UserError(f"{place} is {quoted(value)}, but it must be an object")
-    return value
+            _check_text(name, place, 1)
+            _check_text(part, place, depth - 1)

@@ -211,6 +211,9 @@ def _add_item(connection: Connection, project: int, new: NewItem) -> tuple[int, 
         raise UserError(f"an item has {len(new.candidates)} candidates, but at least 2 can be compared")
     if new.best is not None and not 0 <= new.best < len(new.candidates):
         raise UserError(f"the best candidate of an item is {new.best}, but there are {len(new.candidates)}, counted from 0")
+    unnamed = next((each.made_by for each in new.candidates if not each.made_by.isprintable()), None)
+    if unnamed is not None:
+        raise UserError(f"a candidate is made by {quoted(unnamed)}, but names of models must be printable")
     if new.raters < 1:
         raise UserError(f"an item is for {new.raters} raters, but at least 1 is needed")
     row = {"project_id": project, "content": dict(new.prompt), "source": new.source or None}

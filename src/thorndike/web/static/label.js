@@ -1,19 +1,11 @@
 // The labelling page. Items are fetched before they are needed, so that the next one is there at once. A judgement is kept in this browser
 // until the server has said that it is on the disk; until then it is sent again, under the same name, so that it counts once.
-"use strict";
+import { element, letter, parts, showsSpaces, toggleSpaces } from "./label_content.js";
 
 const AHEAD = 8;
 const RETRY_MS = [200, 500, 1000, 2000, 4000];
 const RATE_WINDOW_MS = 5 * 60 * 1000;
 const $ = (id) => document.getElementById(id);
-const element = (tag, classes, text) => {
-  const made = document.createElement(tag);
-  if (classes) made.className = classes;
-  if (text !== undefined) made.textContent = text;
-  return made;
-};
-const letter = (place) => String.fromCharCode(65 + place);
-
 let rater = "";
 let about = { project: "", guidelines: "" };
 let queue = [];            // items to judge; the first is on the screen
@@ -220,48 +212,9 @@ function card(item, content, place) {
   return made;
 }
 
-function parts(content, place = 0) {
-  const found = [];
-  if (content.kind === "video") {
-    const video = element("video");
-    Object.assign(video, { src: content.media, loop: true, muted: true, playsInline: true, preload: "auto" });
-    video.setAttribute("aria-label", `Clip ${letter(place)}`);
-    // Who asked for less motion starts clips by the space bar or the controls.
-    if (matchMedia("(prefers-reduced-motion: reduce)").matches) video.controls = true;
-    else video.autoplay = true;
-    found.push(video);
-  } else if (content.kind === "image") {
-    const image = element("img");
-    image.src = content.media;
-    image.alt = `Clip ${letter(place)}`;
-    found.push(image);
-  } else if (content.kind === "unknown") found.push(element("p", "quiet", "This kind of file cannot be shown: skip it."));
-  if (content.text !== undefined) found.push(marked(element("div", "content"), content.text));
-  for (const message of content.messages ?? []) {
-    const turn = element("div", "turn");
-    turn.append(element("span", "role", message.role), marked(element("div", "content"), message.content));
-    found.push(turn);
-  }
-  return found;
-}
-
-function marked(box, text) {
-  box.dataset.text = text;
-  if (!showsSpaces()) { box.textContent = text; return box; }
-  box.replaceChildren(...text.split(/( |\t|\n)/).filter((part) => part !== "").flatMap((part) => {
-    const sign = { " ": "·", "\t": "→\t", "\n": "↵\n" }[part];
-    // Lines may break after a sign, as they did at the space.
-    return sign ? [element("span", "mark", sign), document.createElement("wbr")] : [document.createTextNode(part)];
-  }));
-  return box;
-}
-
-const showsSpaces = () => localStorage.getItem("thorndike-label-spaces") === "yes";
-
-function toggleSpaces() {
-  localStorage.setItem("thorndike-label-spaces", showsSpaces() ? "no" : "yes");
+function switchSpaces() {
+  toggleSpaces();
   $("whitespace").setAttribute("aria-pressed", String(showsSpaces()));
-  document.querySelectorAll(".content").forEach((box) => marked(box, box.dataset.text));
 }
 
 function drawVerdicts(count) {
@@ -361,7 +314,7 @@ function pressed(event) {
   if (event.key === "Enter" && event.target.closest("button, summary, a")) return;
   const item = queue[0];
   const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
-  const anywhere = { u: undo, g: openGuidelines, w: toggleSpaces };
+  const anywhere = { u: undo, g: openGuidelines, w: switchSpaces };
   const pair = {
     1: () => judge("a"), ArrowLeft: () => judge("a"), 2: () => judge("b"), ArrowRight: () => judge("b"), 3: () => judge("tie"),
     t: () => judge("tie"), 4: () => judge("both_bad"), b: () => judge("both_bad"), s: () => judge("skip"), " ": toggleClips,
@@ -413,7 +366,7 @@ $("skip").addEventListener("click", () => judge("skip"));
 $("undo").addEventListener("click", undo);
 $("undo-last").addEventListener("click", undo);
 $("again").addEventListener("click", () => { exhausted = false; more(); });
-$("whitespace").addEventListener("click", toggleSpaces);
+$("whitespace").addEventListener("click", switchSpaces);
 window.addEventListener("online", send);
 
 about = await (await fetch("/label/about")).json();

@@ -1,0 +1,29 @@
+"""``thorndike language dpo MODEL``: a policy from preferences, without a reward model."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from thorndike.cli.answer import Answer
+from thorndike.cli.language.aligning import add_training_arguments, lora_of
+from thorndike.cli.language.arguments import given_settings, prepare_device, settings_in_words
+from thorndike.cli.language.report import report
+from thorndike.cli.parser import Parser
+
+EXAMPLES = """\
+  thorndike language dpo MODEL --data preferences.jsonl --out runs/dpo
+  thorndike language dpo MODEL --data preferences.jsonl --out runs/dpo --set beta=0.05 --set label_smoothing=0.1
+The same command again goes on where it stopped. Without total_steps it is one pass over the data. Settings:
+{settings}"""
+
+
+def run(words: Sequence[str]) -> Answer:
+    """Learn from preferences, and say how well."""
+    parser = Parser("language dpo", "Direct preference optimisation on TRL's columns.", EXAMPLES.format(settings=settings_in_words("dpo")))
+    add_training_arguments(parser)
+    parser.add_argument("--data", type=Path, action="append", required=True, metavar="FILE", help="rows with chosen and rejected")
+    options = parser.parse(words)
+    settings = given_settings(options.settings, "dpo")
+    prepare_device(options.device, options.model)
+    from thorndike.language.aligning import align_by_preferences
+
+    return report(align_by_preferences(options.model, options.data, options.out, settings, lora=lora_of(options.lora), seed=options.seed))

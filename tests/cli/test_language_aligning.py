@@ -1,0 +1,122 @@
+"""The verbs that learn from preferences and rewards: what they answer, what they leave behind, mistakes in one line."""
+
+import json
+from pathlib import Path
+
+import jax
+import pytest
+
+from thorndike.cli.main import main
+from thorndike.language.decoder import initial_params
+from thorndike.language.model import LanguageModel, load_model, save_model
+from thorndike.language.pretraining import Config, small_llama, train_tokenizer
+from thorndike.language.reward_files import load_reward_model
+
+pytestmark = pytest.mark.usefixtures("quick_compile")
+SMALL = ["--set=episodes=8", "--set=batch_size=4", "--set=max_new_tokens=4", "--set=max_prompt_length=12", "--set=total_steps=2"]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A model that has learnt nothing, prompts, preferences for long words, and a reward function."""
+    path = tmp_path_factory.mktemp("aligning")
+    texts = [f"The {what} is {how}." for what in ("film", "play", "book") for how in ("good", "bad", "long")]
+    tokenizer = train_tokenizer(texts, 270)
+    config = small_llama(Config(vocab_size=270, hidden_size=16, num_layers=1, num_heads=2, intermediate_size=24), tokenizer)
+    save_model(LanguageModel(config, initial_params(config, jax.random.key(0)), tokenizer), path / "base")
+    (path / "prompts.jsonl").write_text(
+        "".join(json.dumps({"prompt": f"The {each}"}) + "\n" for each in ("film", "play", "book", "film is"))
+    )
+    rows = [{"prompt": "The film", "chosen": f" {'z' * (2 + n % 3)} is", "rejected": f" a{n % 4}", "p_chosen": 0.9} for n in range(80)]
+    (path / "preferences.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    (path / "rewards.py").write_text("def length(prompts, completions, ids):\n    return [len(text) for text in completions]\n")
+    return path
+
+
+def answer(capsys: pytest.CaptureFixture[str], *words: str) -> dict:
+    status = main(["language", *words, "--json"])
+    told = capsys.readouterr()
+    assert status == 0, told.err
+    return json.loads(told.out)
+
+
+@pytest.fixture(scope="module")
+def reward(folder: Path) -> Path:
+    """A reward model made by the command."""
+    words = ["--data", str(folder / "preferences.jsonl"), "--out", str(folder / "reward"), "--members", "2"]
+    settings = ["--set=pool=mean", "--set=batch_size=8", "--set=total_steps=40", "--set=learning_rate=0.01"]
+    assert main(["language", "reward", str(folder / "base"), *words, *settings]) == 0
+    return folder / "reward" / "model"
+
+
+def test_a_reward_model_says_how_good_it_is(folder: Path, reward: Path) -> None:
+    model, told = load_reward_model(reward), json.loads((folder / "reward" / "outcome.json").read_text())
+    assert len(model.members) == 2 and model.held_out is not None
+    assert told["pairs"] == model.held_out.pairs == 8 and told["accuracy"] == model.held_out.accuracy > 0.9
+    assert model.pool == "mean" and model.deviation > 0
+
+
+@pytest.mark.parametrize("verb", ["ppo", "rloo"])
+def test_a_policy_is_trained_on_it_and_compared(verb: str, folder: Path, reward: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = folder / verb
+    words = [verb, str(folder / "base"), "--reward", str(reward), "--reward", f"0.1*{folder}/rewards.py:length", "--out", str(out)]
+    words += ["--prompts", str(folder / "prompts.jsonl"), "--max-kl", "50", *SMALL, *(["--set=group=4"] if verb == "rloo" else [])]
+    found = answer(capsys, *words)
+    assert found["iterations"] == 2 and found["stopped"] is None and 0.0 <= found["judged"]["reward"]["win_rate"] <= 1.0
+    assert load_model(out / "model").config == load_model(folder / "base").config
+    assert len((out / "metrics.jsonl").read_text().splitlines()) == 2 and json.loads((out / "comparison.json").read_text())["samples"]
+    assert answer(capsys, *words) == found  # the same command finds it done
+
+
+def test_dpo_and_eval(folder: Path, reward: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["dpo", str(folder / "base"), "--data", str(folder / "preferences.jsonl"), "--out", str(folder / "dpo")]
+    found = answer(capsys, *words, "--set=batch_size=8", "--set=learning_rate=0.01", "--set=total_steps=12")
+    assert found["status"] == "finished" and found["steps"] == 12 and found["train/reward_margin"] > 0
+    words = ["eval", str(folder / "dpo" / "model"), "--base", str(folder / "base"), "--prompts", str(folder / "prompts.jsonl")]
+    seen = answer(capsys, *words, "--reward", str(reward), "--reward", f"{folder}/rewards.py:length", "--max-new-tokens", "4")
+    assert seen["kl"] > 0.01 and set(seen["judged"]) == {str(reward), f"{folder}/rewards.py:length"} and seen["prompts"] == 4
+
+
+def test_mistakes_are_one_line(folder: Path, reward: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    base, prompts = str(folder / "base"), str(folder / "prompts.jsonl")
+    ppo = ["ppo", base, "--prompts", prompts, "--out", str(tmp_path / "x"), *SMALL]
+    (tmp_path / "same.jsonl").write_text('{"prompt": "a", "chosen": "b", "rejected": "b"}\n')
+    (tmp_path / "odd.jsonl").write_text('{"prompt": "a", "chosen": "b", "rejected": "c", "p_chosen": 2}\n')
+    (tmp_path / "wrong.py").write_text("def score(prompts, completions, ids):\n    return 1.0\n")
+    cases = [
+        ([*ppo, "--reward", "nowhere"], "is no reward"),
+        ([*ppo, "--reward", "x*nowhere"], "WEIGHT*WHAT"),
+        ([*ppo, "--reward", f"{folder}/rewards.py:width"], "no function width"),
+        ([*ppo, "--reward", base], "without a scalar head"),
+        ([*ppo, "--reward", f"{tmp_path}/wrong.py:score"], "a number a text"),
+        ([*ppo, "--reward", str(reward), "--max-kl", "-1"], "above 0"),
+        ([*ppo, "--reward", str(reward), "--set", "target_kll=3"], "did you mean"),
+        (["rloo", *ppo[1:], "--reward", str(reward), "--set", "baseline=group"], "thorndike language grpo"),
+        (["dpo", base, "--data", str(tmp_path / "same.jsonl"), "--out", str(tmp_path / "y")], "same.jsonl, row 1: chosen and rejected"),
+        (["dpo", base, "--data", str(tmp_path / "odd.jsonl"), "--out", str(tmp_path / "y")], "odd.jsonl, row 1: p_chosen is 2"),
+        (["reward", base, "--data", prompts, "--out", str(tmp_path / "y")], "expected a preference"),
+        (["eval", str(reward), "--base", base, "--prompts", prompts, "--reward", str(reward)], "not of the shape"),
+        (["demo", "--out", str(tmp_path / "z"), "--learners", "pppo"], "did you mean 'ppo'"),
+    ]
+    for words, expected in cases:
+        assert main(["language", *words]) == 2, words
+        error = capsys.readouterr().err
+        assert expected in error and error.count("\n") == 1, error
+
+
+def test_a_model_near_chance_is_refused(folder: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    rows = [{"prompt": "The film", "chosen": f" {'ab'[n % 2]}", "rejected": f" {'ba'[n % 2]}"} for n in range(40)]
+    (tmp_path / "noise.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    words = [
+        "reward",
+        str(folder / "base"),
+        "--data",
+        str(tmp_path / "noise.jsonl"),
+        "--out",
+        str(tmp_path / "noise"),
+        "--set=batch_size=8",
+    ]
+    assert answer(capsys, *words)["near_chance"] is True
+    ppo = ["ppo", str(folder / "base"), "--prompts", str(folder / "prompts.jsonl"), "--out", str(tmp_path / "x"), *SMALL]
+    assert main(["language", *ppo, "--reward", str(tmp_path / "noise" / "model")]) == 2
+    assert "which guessing explains" in capsys.readouterr().err
