@@ -15,6 +15,12 @@ def attribute_in_file(name: str) -> tuple[Path, str] | None:
     return (Path(path), attribute) if path.endswith(".py") else None
 
 
+def lasting_name(name: str) -> str:
+    """What a file defines by the file's absolute path, so that its run finds it from every folder; other names as they are."""
+    file, _, attribute = name.rpartition(":")
+    return f"{Path(file).absolute()}:{attribute}" if file.endswith(".py") and Path(file).is_file() else name
+
+
 def load_file(path: Path, what: str) -> ModuleType:
     """The module in a file, imported once. Raises UserError if there is none, or it cannot be imported; ``what`` it should define."""
     if not path.is_file():

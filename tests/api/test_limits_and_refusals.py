@@ -10,7 +10,6 @@ import pytest
 
 import thorndike as td
 from thorndike.algorithms import sac
-from thorndike.api.building import lasting_name
 from thorndike.api.loading import bounded
 from thorndike.environments import registry, wrappers
 from thorndike.environments.native import factory
@@ -19,6 +18,7 @@ from thorndike.environments.origins import limit_of, name_of
 from thorndike.errors import UserError
 from thorndike.training.evaluation import Evaluation
 from thorndike.training.policy import Policy
+from thorndike.user_code import lasting_name
 
 
 def test_an_environment_that_only_a_native_engine_has_keeps_its_time_limit_in_evaluation():

@@ -200,7 +200,7 @@ def test_a_trained_run_plays(place, capsys):
     run = td.train("alphazero", "tic_tac_toe", steps=512, num_envs=8, settings={"learning_starts": 64, "batch_size": 32}).run
     assert main(["arena", "tic_tac_toe", "latest", "random", "--games", "4", "--simulations", "8", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
-    assert told["players"][0]["player"] == run.name
+    assert told["players"][0]["player"] == f"{run.name}:simulations=8"
     assert main(["arena", "connect_four", "latest", "random"]) == 2
     assert "was trained on tic_tac_toe, not on connect_four" in capsys.readouterr().err
     assert td.play_match("tic_tac_toe", run, td.load(run), games=2, simulations=0).tally.total.games == 2

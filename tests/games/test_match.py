@@ -120,6 +120,15 @@ def test_a_file_of_another_match_is_refused(tmp_path, change, words):
         play_match(TIC_TAC_TOE, (in_order("a"), in_order("b")), 2, seed=5, path=path)
 
 
+@pytest.mark.parametrize("content", [b"notes of mine", b"notes\nof mine", b'{"format": "thorndike-game"}\n{"a'])
+def test_a_file_of_something_else_is_left_as_it_is(tmp_path, content):
+    path = tmp_path / "match.jsonl"
+    path.write_bytes(content)
+    with pytest.raises(UserError, match=r"match\.jsonl"):
+        play_match(TIC_TAC_TOE, (in_order("a"), in_order("b")), 2, path=path)
+    assert path.read_bytes() == content
+
+
 @pytest.mark.parametrize(
     "line", ["[]", "{", '{"number": 1}', '{"number": 0, "players": ["a"], "opening": 0, "moves": [], "score": 1, "remark": ""}']
 )

@@ -35,6 +35,11 @@ def test_the_one_of_tic_tac_toe_loses_no_line_even_without_searching():
     assert [each.lost for each in walked] == [0, 0]
 
 
+def test_its_strength_stands_in_its_name_so_that_kept_games_of_another_are_not_taken_for_its_own():
+    assert td.player("trained", "tic_tac_toe").name == "trained"
+    assert td.player("trained", "tic_tac_toe", simulations=8).name == "trained:simulations=8"
+
+
 @pytest.mark.parametrize("name", ["", "no_such_game", "../tic_tac_toe", "tic_tac_toe/policy"])
 def test_there_is_none_of_other_names(name):
     assert trained_run(name) is None

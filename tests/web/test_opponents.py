@@ -1,15 +1,21 @@
 """Who is offered for which game, and that they play."""
 
+import hashlib
+import json
+import shutil
 from pathlib import Path
 
 import jax
 import pytest
 
 from made_up_runs import write_run
+from thorndike.cli.choose_player import choose_player
 from thorndike.errors import UserError
 from thorndike.games.game import Turn
 from thorndike.games.registry import game
 from thorndike.games.saved_game import saved_game_file
+from thorndike.games.trained import trained_run
+from thorndike.training.json_files import as_bytes
 from thorndike.web import opponents as module
 from thorndike.web.opponents import PERSON, opponents_in
 from thorndike.web.studio import MOST_TABLES, Setup, Studio
@@ -102,3 +108,19 @@ def test_a_game_of_ones_own_is_played_and_saved_and_opened(tmp_path):
     view = place.table.view()
     data = saved_game_file(place.table.game, 0, ["A", "B"], view.names, view.choices)
     assert rooms.place(rooms.open_saved(data, "the file")).setup.game == name
+
+
+def test_a_run_on_a_game_of_ones_own_is_found_by_any_way_to_its_file_and_sits_down(tmp_path, monkeypatch):
+    (tmp_path / "mine.py").write_text("from thorndike.games.tic_tac_toe import TIC_TAC_TOE as MINE\n")
+    name = f"{tmp_path}/mine.py:MINE"
+    run = write_run(tmp_path / "runs/mine/alphazero/20260101-000000-own", algorithm="alphazero", environment=name, seeds=1)
+    policy = shutil.copytree(trained_run("tic_tac_toe") / "policy", run / "policy", dirs_exist_ok=True)
+    facts, manifest = (json.loads((policy / file).read_text()) for file in ("policy.json", "manifest.json"))
+    text = json.dumps(facts | {"environment": name}).encode()
+    manifest["files"]["policy.json"] = {"bytes": len(text), "sha256": hashlib.sha256(text).hexdigest()}
+    (policy / "policy.json").write_bytes(text)
+    (policy / "manifest.json").write_bytes(as_bytes(manifest))
+    monkeypatch.chdir(tmp_path)
+    first = opponents_in(Path("runs"))("mine.py:MINE")[0]
+    assert first.make(game("mine.py:MINE"), 4).name == "alphazero, 20260101-000000-own"
+    assert choose_player("latest", "mine.py:MINE", Path("runs")).resolve() == run

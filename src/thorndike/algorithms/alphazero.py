@@ -198,7 +198,8 @@ def alphazero(config: Config, spec: EnvSpec) -> Algorithm:
     """AlphaZero for a game. Raises ``UserError`` for an environment that is no game of two players without dice."""
     game = spec.game
     if game is None or game.num_players != 2 or game.has_chance:
-        raise UserError(f"alphazero plays games of two players without dice (connect_four, ...), which {spec.id} is not: train it with ppo")
+        instead = "no learner here plays against itself by dice" if game is not None and game.has_chance else "train it with ppo"
+        raise UserError(f"alphazero plays games of two players without dice (connect_four, ...), which {spec.id} is not: {instead}")
     network = board_network(game.num_actions, config.tower, config.width, config.blocks)
     optimizer = optax.chain(
         optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam(), optax.add_decayed_weights(config.weight_decay)

@@ -34,6 +34,7 @@ from thorndike.training.segment import page_length
 from thorndike.training.session import Plan
 from thorndike.training.sources import compiled_source
 from thorndike.types import Algorithm, Environment, EnvSpec, Source, Wrapper
+from thorndike.user_code import lasting_name
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -230,12 +231,6 @@ def check_actors(algorithm: str, choice: registry.Choice, actors: ActorThreads) 
         )
     if isinstance(choice.origin, gymnasium.vector.VectorEnv):
         raise UserError(f"{choice.id} is one vector, and each actor thread needs its own: give the id or class of its environment")
-
-
-def lasting_name(environment: str) -> str:
-    """A class in a file by the file's absolute path, so that its run finds it from every folder; other names as they are."""
-    file, _, name = environment.rpartition(":")
-    return f"{Path(file).absolute()}:{name}" if file.endswith(".py") and Path(file).is_file() else environment
 
 
 def build_job(

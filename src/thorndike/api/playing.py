@@ -19,6 +19,7 @@ from thorndike.games.pgn import write_pgn
 from thorndike.games.player_names import MCTS, RANDOM, TRAINED, check_player, mcts_simulations
 from thorndike.games.players import mcts_player, random_player
 from thorndike.games.registry import game as find_game
+from thorndike.games.registry import is_game
 from thorndike.games.sgf import can_be_sgf, write_sgf
 from thorndike.games.trained import trained_run
 from thorndike.statistics.ratings import Games, Ratings, fit_ratings
@@ -54,11 +55,13 @@ def player(who: PlayerLike, game: Game | str, *, simulations: int = SIMULATIONS,
         if is_engine(who):
             return engine(who, rules.id)
     if who == TRAINED:
-        return _agent(load(cast(Path, trained_run(rules.id))), rules, simulations)._replace(name=TRAINED)
+        return _agent(TRAINED, load(cast(Path, trained_run(rules.id))), rules, simulations)
     loaded = who if isinstance(who, LoadedPolicy) else load(who)
-    if loaded.facts["environment"] not in (rules.id, game):
-        raise UserError(f"{loaded.run} was trained on {loaded.facts['environment']}, not on {rules.id}")
-    return _agent(loaded, rules, simulations)
+    trained_on = str(loaded.facts["environment"])
+    # A game of the user's own is called by its file or module where it was trained by its name.
+    if trained_on != rules.id and not (is_game(trained_on) and find_game(trained_on).id == rules.id):
+        raise UserError(f"{loaded.run} was trained on {trained_on}, not on {rules.id}")
+    return _agent(loaded.run.name if loaded.run is not None else "agent", loaded, rules, simulations)
 
 
 def play_match(
@@ -144,10 +147,11 @@ def _rows(pair: tuple[int, int], match: Match) -> list[Games]:
     return [Games(*pair, *first), Games(pair[1], pair[0], second.losses, second.draws, second.wins)]
 
 
-def _agent(loaded: LoadedPolicy, rules: Game, simulations: int) -> Player:
+def _agent(label: str, loaded: LoadedPolicy, rules: Game, simulations: int) -> Player:
     policy = loaded.policy
     actor, statistics = jax.tree.map(lambda leaf: leaf[policy.best], (policy.actors, policy.statistics))
-    label = loaded.run.name if loaded.run is not None else "agent"
+    # Games that are kept are told apart by the players' names: those of another strength must not be taken for this one's.
+    label += "" if simulations == SIMULATIONS else f":simulations={simulations}"
     return agent_player(label, rules, policy.algorithm, policy.wrapper, actor, statistics, loaded.facts["config"], simulations)
 
 

@@ -9,6 +9,7 @@ from thorndike.games.player_names import check_player, is_run, known_players, su
 from thorndike.games.registry import game, game_ids
 from thorndike.records import from_policy, read_policy_facts
 from thorndike.suggestions import did_you_mean
+from thorndike.user_code import lasting_name
 
 GAME_HELP = "a game: connect_four, othello, go_9x9, chess, ...; or yours, path/to/file.py:NAME"
 PLAYER_HELP = "random, mcts, mcts:simulations=400, trained, gnugo:level=3, rhino:level=3, stockfish:elo=1500, fairy:skill=-10, or a run"
@@ -46,6 +47,6 @@ def choose_player(text: str, game_name: str, output: Path) -> str | Path:
     directory = find_run(text, output)
     from_policy(directory, read_policy_facts)
     trained_on = read_facts(directory).get("environment")
-    if trained_on != game_name:
+    if trained_on != lasting_name(game_name):
         raise UserError(f"{directory} was trained on {trained_on}, not on {game_name}")
     return directory

@@ -50,22 +50,22 @@ class MatchFile:
         """The games that are there. Raises UserError for a file of another match, or of something else."""
         if self._path is None:
             return []
-        path = self._path
+        path, beginning = self._path, json.dumps(self._facts).encode()
         try:
-            lines = path.read_bytes().split(b"\n") if path.exists() else [b""]
-            whole_lines = lines[:-1]
-            if not whole_lines:
-                path.parent.mkdir(parents=True, exist_ok=True)
-                _write(path, json.dumps(self._facts).encode() + b"\n")
-                return []
-            if lines[-1]:
-                _write(path, b"\n".join(whole_lines) + b"\n")
+            *whole_lines, rest = path.read_bytes().split(b"\n") if path.exists() else [b""]
         except OSError as error:
-            raise UserError(f"{path} cannot be written: {error.strerror}") from error
+            raise UserError(f"{path} cannot be read: {error.strerror}") from error
+        if not whole_lines:
+            if not beginning.startswith(rest):
+                raise UserError(f"{path} holds something else, not the games of a match: keep them in another folder")
+            _write(path, beginning + b"\n")
+            return []
         found = parse_object(whole_lines[0], path)
         for name, value in self._facts.items():
             if found.get(name) != value:
                 raise UserError(f"{path} is of another match: its {name} is {json.dumps(found.get(name))[:60]}, not {json.dumps(value)}")
+        if rest:
+            _write(path, b"\n".join(whole_lines) + b"\n")
         return [_played(line, f"{path}, line {number}") for number, line in enumerate(whole_lines[1:], start=2)]
 
     def append(self, played: PlayedGame) -> None:
@@ -79,8 +79,12 @@ class MatchFile:
 
 def _write(path: Path, data: bytes) -> None:
     aside = path.with_name(path.name + ".part")
-    aside.write_bytes(data)
-    aside.replace(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        aside.write_bytes(data)
+        aside.replace(path)
+    except OSError as error:
+        raise UserError(f"{path} cannot be written: {error.strerror}") from error
 
 
 def _played(line: bytes, where: str) -> PlayedGame:

@@ -76,7 +76,7 @@ def search(
     Raises ``UserError`` for games of one player, and games with dice.
     """
     if game.num_players != 2 or game.has_chance:
-        raise UserError(f"the search is for two players without dice, which {game.id} is not: train it with ppo")
+        raise UserError(f"the search is for two players without dice, which {game.id} is not")
     key_root, key_search = jax.random.split(key)
     logits, value = evaluate(params, positions, key_root)
     legal = jax.vmap(game.legal)(positions)

@@ -10,6 +10,7 @@ from thorndike.games.engines import ENGINES, program_of
 from thorndike.games.game import Game, Player
 from thorndike.games.registry import game as find_game
 from thorndike.games.trained import trained_run
+from thorndike.user_code import lasting_name
 
 PERSON = "person"
 STRENGTHS = (16, 64, 200, 800, 3200)
@@ -82,7 +83,7 @@ def _named(who: str, name: str, searches: bool = False, before: str = "", after:
 def _trained_on(run: Path, game_id: str) -> bool:
     """Whether a run has a policy for this game. One whose files are damaged has not."""
     try:
-        return read_facts(run).get("environment") == game_id and (run / "policy").is_dir()
+        return read_facts(run).get("environment") == lasting_name(game_id) and (run / "policy").is_dir()
     except (UserError, OSError):
         return False
 
