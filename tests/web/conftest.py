@@ -57,7 +57,7 @@ def browser():
 def context(browser, studio):
     """A browser that was let in. Whatever it asks for, and whatever its console says, is looked at after each test."""
     opened = browser.new_context(viewport={"width": 1100, "height": 800}, reduced_motion="reduce")
-    opened.set_default_timeout(15_000)
+    opened.set_default_timeout(60_000)
     page = opened.new_page()
     page.goto(studio.address)
     page.wait_for_selector("h1")

@@ -9,7 +9,7 @@ pytest.importorskip("nicegui")
 from playwright.sync_api import Page, expect
 
 # The machine may be busy with other tests.
-expect.set_options(timeout=20_000)
+expect.set_options(timeout=60_000)
 
 
 def start(page: Page, studio, game="tic_tac_toe", opponent=None, strength=None, begins=None) -> Page:

@@ -65,7 +65,7 @@ def sign_in(browser, labelled):
 
     def open_page(name, **options):
         context = browser.new_context(viewport={"width": 1200, "height": 850}, **options)
-        context.set_default_timeout(15_000)
+        context.set_default_timeout(60_000)
         page = context.new_page()
         page.on("request", lambda request: asked.append(request.url))
         page.on("pageerror", lambda error: errors.append(str(error)))
@@ -106,7 +106,7 @@ def prefer_good(page):
 
 
 def all_saved(page):
-    page.wait_for_function("document.getElementById('saved').textContent === 'All saved'", timeout=20_000)
+    page.wait_for_function("document.getElementById('saved').textContent === 'All saved'", timeout=60_000)
 
 
 def interrupted(labelled, sign_in, raters, each):

@@ -76,7 +76,9 @@ class Pool(NamedTuple):
         with self.clock.waiting:
             host = np.asarray(action)
         with self.clock.environment:
-            return jax.tree.map(self._by_seed, self.engine.step(host.reshape((self.seeds * self.num_envs, *host.shape[2:]))))
+            step = self.engine.step(host.reshape((self.seeds * self.num_envs, *host.shape[2:])))
+            numbers = (x.reshape(self.seeds, self.num_envs) for x in step[2:])
+            return Step(jax.tree.map(self._by_seed, step.obs), jax.tree.map(self._by_seed, step.next_obs), *numbers)
 
     def _by_seed(self, x: np.ndarray) -> np.ndarray:
         return x.reshape((self.seeds, self.num_envs, *x.shape[1:]))
@@ -106,9 +108,12 @@ class Tally:
         """Count a step; episodes that end in it are summed up and start again from 0."""
         self.total += step.reward * step.valid
         self.age += step.valid
+        self.sums[3] += step.valid.sum(1)
         done = step.done & step.valid
-        self.sums += (done.sum(1), (self.total * done).sum(1), (self.age * done).sum(1), step.valid.sum(1))
-        self.total[done], self.age[done] = 0.0, 0
+        # Most steps end nothing, and each of these sums is a call.
+        if done.any():
+            self.sums[:3] += (done.sum(1), (self.total * done).sum(1), (self.age * done).sum(1))
+            self.total[done], self.age[done] = 0.0, 0
 
 
 def environment_seeds(seed: int, indices: Sequence[int], num_envs: int, *stream: int) -> list[int]:

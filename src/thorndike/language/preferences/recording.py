@@ -77,13 +77,15 @@ def _once(database: Database, request: str, append: Callable[[Connection], int |
         with database.writing() as connection:
             found = connection.execute(query).scalar()
             return append(connection) if found is None else int(found)
-    except IntegrityError as error:
-        # Somebody else wrote meanwhile: the same request, or another about the same assignment.
+    except (IntegrityError, UserError) as error:
+        # Somebody else may have written after the look: the same request, which is answered alike, or another about the same assignment.
         with database.reading() as connection:
             found = connection.execute(query).scalar()
-        if found is None:
-            raise UserError("this was judged from elsewhere at the same moment: load it anew") from error
-        return int(found)
+        if found is not None:
+            return int(found)
+        if isinstance(error, UserError):
+            raise
+        raise UserError("this was judged from elsewhere at the same moment: load it anew") from error
 
 
 def _judge(connection: Connection, response: Response) -> int:
