@@ -10,7 +10,7 @@ from thorndike.errors import UserError
 from thorndike.games import pgx_games
 from thorndike.games.environment import game_environment
 from thorndike.games.game import named_action
-from thorndike.games.registry import ADAPTED_GAMES, game
+from thorndike.games.registry import ADAPTED_GAMES, FOR_ONE, WITH_DICE, game
 
 SLOW_RULES = {"othello": SlowOthello, "go_9x9": lambda: SlowGo(9), "hex": SlowHex}
 QUICK = ["othello", "hex", "go_9x9"]
@@ -21,6 +21,13 @@ LATE = ["go_19x19", "gardner_chess", "animal_shogi", "backgammon", "2048", "ches
 @pytest.fixture(scope="module", params=[*QUICK, *(pytest.param(id, marks=pytest.mark.slow) for id in LATE)])
 def compiled(request, quick_compile):
     return Compiled(game(request.param))
+
+
+@pytest.mark.parametrize("id", [*FOR_ONE, *WITH_DICE, "othello"])
+def test_games_for_one_and_games_with_dice_are_known_before_they_are_made(id):
+    made = game(id)
+    assert (made.num_players == 1) == (id in FOR_ONE)
+    assert (made.num_players == 2 and made.has_chance) == (id in WITH_DICE)
 
 
 def random_moves(random, compiled, most=10**9):

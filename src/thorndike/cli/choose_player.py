@@ -6,15 +6,13 @@ from pathlib import Path
 from thorndike.cli.find_run import all_runs, exists, find_run, read_facts
 from thorndike.errors import UserError
 from thorndike.games.player_names import check_player, is_run, known_players, suggestion
-from thorndike.games.registry import game, game_ids
+from thorndike.games.registry import FOR_ONE, WITH_DICE, game, game_ids
 from thorndike.records import from_policy, read_policy_facts
 from thorndike.suggestions import did_you_mean
 from thorndike.user_code import lasting_name
 
 GAME_HELP = "a game: connect_four, othello, go_9x9, chess, ...; or yours, path/to/file.py:NAME"
 PLAYER_HELP = "random, mcts, mcts:simulations=400, trained, gnugo:level=3, rhino:level=3, stockfish:elo=1500, fairy:skill=-10, or a run"
-_ALONE = ("2048",)
-_WITH_DICE = ("backgammon",)
 
 
 def check_game(name: str, alone: bool) -> bool:
@@ -27,7 +25,7 @@ def check_game(name: str, alone: bool) -> bool:
     else:
         if name not in game_ids():
             raise UserError(f"unknown game {name!r}{did_you_mean(name, game_ids())}")
-        one = name in _ALONE
+        one = name in FOR_ONE
     if one and not alone:
         raise UserError(f"{name} is played by one, so nobody can play against anybody; see: thorndike play {name}")
     return one
@@ -36,7 +34,7 @@ def check_game(name: str, alone: bool) -> bool:
 def choose_player(text: str, game_name: str, output: Path) -> str | Path:
     """A short name that can play, or the directory of the run meant. Raises UserError for anything else."""
     if not is_run(text):
-        check_player(text, game_name, game_name not in (*_WITH_DICE, *_ALONE))
+        check_player(text, game_name, game_name not in (*WITH_DICE, *FOR_ONE))
         return text
     if not exists(Path(text)) and text != "latest":
         runs = all_runs(output)

@@ -30,6 +30,8 @@ ADAPTED_GAMES: Mapping[str, str] = MappingProxyType(
     )
 )
 """Id -> ``module:function`` that makes the game of this id."""
+FOR_ONE, WITH_DICE = ("2048",), ("backgammon",)
+"""Ids of games that one plays alone, and of those of two that throw dice, which is known here because to make some games takes seconds."""
 _FORMS = "path/to/file.py:NAME"
 
 

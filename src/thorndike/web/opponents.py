@@ -8,6 +8,7 @@ from thorndike.cli.find_run import all_runs, read_facts
 from thorndike.errors import UserError
 from thorndike.games.engines import ENGINES, program_of
 from thorndike.games.game import Game, Player
+from thorndike.games.registry import FOR_ONE, WITH_DICE
 from thorndike.games.registry import game as find_game
 from thorndike.games.trained import trained_run
 from thorndike.user_code import lasting_name
@@ -35,8 +36,6 @@ Opponents: TypeAlias = Callable[[str], Sequence[Opponent]]
 
 ANOTHER_PERSON = Opponent(PERSON, "Another person, here", None)
 ALONE = Opponent(PERSON, "Nobody: one plays alone", None)
-_ONE_PLAYER, _WITH_DICE = ("2048",), ("backgammon",)
-"""Of the games with an id: to make some of them takes seconds."""
 _LONG = ("chess", "shogi", "go_19x19")
 """Games that take a search minutes to play out at random as often as it must."""
 _ENGINE_NAMES = {"gnugo": "GNU Go", "rhino": "grhino", "stockfish": "Stockfish", "fairy": "Fairy-Stockfish"}
@@ -44,7 +43,7 @@ _ENGINE_NAMES = {"gnugo": "GNU Go", "rhino": "grhino", "stockfish": "Stockfish",
 
 def is_for_one(game_id: str) -> bool:
     """Whether one plays this game alone."""
-    return find_game(game_id).num_players == 1 if ":" in game_id else game_id in _ONE_PLAYER
+    return find_game(game_id).num_players == 1 if ":" in game_id else game_id in FOR_ONE
 
 
 def opponents_in(output: Path) -> Opponents:
@@ -53,7 +52,7 @@ def opponents_in(output: Path) -> Opponents:
     def opponents(game_id: str) -> Sequence[Opponent]:
         if is_for_one(game_id):
             return ()
-        searched = not (find_game(game_id).has_chance if ":" in game_id else game_id in _WITH_DICE)
+        searched = not (find_game(game_id).has_chance if ":" in game_id else game_id in WITH_DICE)
         found = [
             _named(str(run), f"{run.parent.name}, {run.name}", searched, before="Trained: ")
             for run in reversed(all_runs(output))
