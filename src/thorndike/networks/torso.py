@@ -67,6 +67,8 @@ class Torso(nn.Module):
         if is_channels_first(space):
             image = jnp.moveaxis(image, 1, -1)
         scaled = image.astype(jnp.float32) / (255.0 if image.dtype == jnp.uint8 else 1.0)
+        if self.cnn == "none":
+            return MLP(self.hidden, self.activation, self.kernel_init, layer_norm=self.layer_norm)(scaled.reshape(scaled.shape[0], -1))
         return CNN(self.hidden or (128,), self.kernel_init, self.layer_norm, self.cnn)(scaled)
 
 
