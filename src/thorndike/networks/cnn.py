@@ -10,7 +10,7 @@ from thorndike.networks.dense import dense
 from thorndike.networks.hidden_layers import SHOWN
 
 CNNS = ("nature", "impala", "none")
-"""The choices of a ``cnn`` setting. ``none``: pixels straight to the dense layers, for boards where convolutions cost more than they find."""
+"""The choices of a ``cnn`` setting. ``none``: pixels go straight to the dense layers, where convolutions cost more than they find."""
 
 LARGE_IMAGE = 36
 """Pixels of the shorter side from which Mnih et al.'s three convolutions fit."""
