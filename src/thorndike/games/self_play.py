@@ -99,8 +99,3 @@ def false_resignations(rows: Rows) -> tuple[Float[Array, ""], Float[Array, ""]]:
     would = rows.resigns & rows.known
     return jnp.mean(would.astype(jnp.float32)), jnp.mean((would & (rows.outcome > -1)).astype(jnp.float32))
 
-
-def players(game: Game, positions: PyTree) -> Int[Array, "T B"]:
-    """Who is to move in packed positions ``[T, B, words]``."""
-    unpack = packing(game).unpack
-    return jax.vmap(jax.vmap(lambda numbers: game.player(unpack(numbers))))(positions)
