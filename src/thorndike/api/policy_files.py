@@ -11,7 +11,6 @@ from thorndike.api.building import build_algorithm
 from thorndike.environments.wrappers import from_settings
 from thorndike.errors import UserError
 from thorndike.games.registry import game
-from thorndike.networks.masking import without_position
 from thorndike.networks.network import NetworkBuilder
 from thorndike.records import from_policy, read_policy_facts
 from thorndike.training.json_files import Json, blamed_on
@@ -46,8 +45,8 @@ def _parts(facts: Json, network: NetworkBuilder | None) -> tuple[Algorithm, Wrap
     observations, actions = (space_from_json(cast(Json, facts[part])) for part in ("observation_space", "action_space"))
     limit = cast(int | None, facts["max_episode_steps"])
     environment, num_envs = cast(str, facts["environment"]), cast(int, facts["num_envs"])
-    # A name of the user's is imported where it is a game's, by which the network is built.
-    rules = game(environment) if ALGORITHMS[name].plays and without_position(observations) is not observations else None
+    # Others than those that search act without the rules.
+    rules = game(environment) if ALGORITHMS[name].only_games else None
     spec = EnvSpec(environment, observations, actions, num_envs=num_envs, max_episode_steps=limit, game=rules)
     return build_algorithm(name, config, wrapper.spec(spec), network), wrapper, spec
 

@@ -79,7 +79,7 @@ def _backgammon_seen(position: Position) -> Float[Array, "1 1 203"]:
     units = [points == 1, points >= 2, points >= 3, jnp.maximum(points - 3.0, 0.0) / 2.0]
     seen = jnp.stack([unit.astype(jnp.float32) for unit in units], axis=-1).reshape(-1)
     rest = jnp.concatenate([sides[0, 24:25], sides[1, 25:26], sides[0, 26:27], sides[1, 27:28]]) / jnp.array([2.0, 2.0, 15.0, 15.0])
-    left = position._playable_dice[:, None] == jnp.arange(6)
+    left = position._playable_dice[:, None] == jnp.arange(6)[None]
     dice = jnp.concatenate([jnp.any(left, axis=0).astype(jnp.float32), jnp.sum(left, dtype=jnp.float32)[None] / 4.0])
     return jnp.concatenate([seen, rest, dice])[None, None]
 
