@@ -8,7 +8,6 @@ from thorndike.games.game import Board, Game
 BEADS, MOST = 8, 3
 
 
-
 def _after(position, action, key):
     """Takes 1 to 3 beads; who takes exactly two moves again, so that turns do not simply alternate."""
     del key

@@ -1,6 +1,5 @@
 """GNU Backgammon: its names of positions and moves against pgx's, and the program itself where it is installed."""
 
-import jax
 import numpy as np
 import pytest
 

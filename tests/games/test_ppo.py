@@ -24,6 +24,8 @@ from thorndike.training.sources import compiled_source
 pytestmark = pytest.mark.usefixtures("quick_compile")
 
 KEY = jax.random.key(0)
+
+
 def slow_values() -> dict[int, tuple[float, set[int]]]:
     """Beads -> what the position is worth to the mover, and its best actions, by looking at all there is."""
     found: dict[int, tuple[float, set[int]]] = {}

@@ -9,6 +9,7 @@ import re
 import time
 from collections.abc import Sequence
 from functools import cache
+from itertools import pairwise
 
 import jax
 import numpy as np
@@ -19,6 +20,7 @@ from thorndike.games.engine_process import EngineProcess
 from thorndike.games.game import Game, Position, Turn
 
 _BAR = 25
+_NAMED = {"bar": _BAR, "off": 0}
 _BEGIN = (
     "set automatic roll off",
     "set automatic game off",
@@ -97,8 +99,8 @@ def hops_of(text: str) -> list[Hop]:
     hops: list[Hop] = []
     for part in text.replace("*", "").split():
         path, _, times = part.partition("(")
-        points = [{"bar": _BAR, "off": 0}.get(point) or int(point.replace("off", "0")) for point in path.split("/")]
-        hops += list(zip(points[:-1], points[1:], strict=True)) * int(times.rstrip(")") or 1)
+        points = [_NAMED[point] if point in _NAMED else int(point) for point in path.split("/")]
+        hops += list(pairwise(points)) * int(times.rstrip(")") or 1)
     return hops
 
 
