@@ -31,7 +31,7 @@ BOX, DISCRETE = spaces.Box(-1.0, 1.0, (17,)), spaces.Discrete(3)
     ids=["sac", "dqn"],
 )
 def test_a_step_beside_a_host_engine_does_not_copy_the_memory_of_transitions(make, action_space):
-    algorithm = make(EnvSpec("x", BOX, action_space, 1, engine="gymnasium", can_vmap=False))
+    algorithm = make(EnvSpec("x", BOX, action_space, 1, engine="gymnasium"))
     state = jax.eval_shape(algorithm.init, jax.random.key(0))
     length = algorithm.needs.rollout_length
     one = jax.eval_shape(lambda: _rollouts(action_space, length))

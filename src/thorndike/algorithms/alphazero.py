@@ -36,7 +36,8 @@ from thorndike.functional.schedules import schedule
 from thorndike.games.game import Game, Position
 from thorndike.games.packing import Packing, packing
 from thorndike.games.search import SEARCHES, Evaluate, Found, SearchSettings, search
-from thorndike.games.self_play import Batch, Manners, as_batch, draw_moves, false_resignations, fresh_memory, move, players
+from thorndike.games.self_play import Batch, Manners, as_batch, draw_moves, false_resignations, fresh_memory, move
+from thorndike.games.turns import players
 from thorndike.networks.board import TOWERS, board_network, win_value
 from thorndike.networks.hidden_layers import look_into
 from thorndike.networks.masking import FORBIDDEN, MASK
@@ -198,8 +199,7 @@ def alphazero(config: Config, spec: EnvSpec) -> Algorithm:
     """AlphaZero for a game. Raises ``UserError`` for an environment that is no game of two players without dice."""
     game = spec.game
     if game is None or game.num_players != 2 or game.has_chance:
-        instead = "no learner here plays against itself by dice" if game is not None and game.has_chance else "train it with ppo"
-        raise UserError(f"alphazero plays games of two players without dice (connect_four, ...), which {spec.id} is not: {instead}")
+        raise UserError(f"alphazero plays games of two players without dice (connect_four, ...), which {spec.id} is not: train it with ppo")
     network = board_network(game.num_actions, config.tower, config.width, config.blocks)
     optimizer = optax.chain(
         optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam(), optax.add_decayed_weights(config.weight_decay)

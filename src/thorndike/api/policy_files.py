@@ -45,7 +45,8 @@ def _parts(facts: Json, network: NetworkBuilder | None) -> tuple[Algorithm, Wrap
     observations, actions = (space_from_json(cast(Json, facts[part])) for part in ("observation_space", "action_space"))
     limit = cast(int | None, facts["max_episode_steps"])
     environment, num_envs = cast(str, facts["environment"]), cast(int, facts["num_envs"])
-    rules = game(environment) if ALGORITHMS[name].plays else None
+    # Others than those that search act without the rules.
+    rules = game(environment) if ALGORITHMS[name].only_games else None
     spec = EnvSpec(environment, observations, actions, num_envs=num_envs, max_episode_steps=limit, game=rules)
     return build_algorithm(name, config, wrapper.spec(spec), network), wrapper, spec
 
