@@ -16,9 +16,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import tokenizers
-from machine import commit, processor
 from tokenizers import decoders, models, pre_tokenizers
 
+from machine import commit, processor
 from thorndike.language.decoder import initial_params
 from thorndike.language.grpo import Config, grpo
 from thorndike.language.model import LanguageModel
