@@ -24,10 +24,10 @@ FIRST_SHARE = 0.25
 
 
 WHILE_ASKING = 0.5
-"""Of the steps, divided among the rounds; what is left is trained on the reward from all choices. Also there the paper asks less and less."""
+"""Of the steps, divided among the rounds; the rest is trained on the reward from all choices. The paper, too, asks less and less."""
 
 
-class Simulated(NamedTuple):
+class SimulatedRater(NamedTuple):
     """A program that judges in place of people: see ``judge_clips``."""
 
     temperature: float = 1.0
@@ -62,7 +62,7 @@ def train_on_choices(
     *,
     choices: int = CHOICES,
     rounds: int = ROUNDS,
-    simulated: Simulated | None = None,
+    simulated: SimulatedRater | None = None,
     films: bool | None = None,
     length: int = LENGTH,
     question: str = QUESTION,
@@ -74,6 +74,7 @@ def train_on_choices(
     settings: Mapping[str, object] | None = None,
     preset: str | None = None,
     engine: str = "auto",
+    device: str = "auto",
     env_kwargs: Mapping[str, object] | None = None,
     max_episode_steps: int | None = None,
     progress: bool = False,
@@ -90,7 +91,13 @@ def train_on_choices(
     check_algorithm(algorithm)
     choice, found = choose(algorithm, environment, preset, engine, env_kwargs, max_episode_steps)
     learner: Json = {"steps": steps or found.steps or DEFAULT_STEPS, "seeds": seeds, "seed": seed, "num_envs": num_envs}
-    learner |= {"settings": dict(settings or {}), "preset": preset, "engine": engine, "max_episode_steps": max_episode_steps}
+    learner |= {
+        "settings": dict(settings or {}),
+        "preset": preset,
+        "engine": engine,
+        "device": device,
+        "max_episode_steps": max_episode_steps,
+    }
     reward = asdict(Config(**(fit or {})))  # type: ignore[arg-type]
     filmed = simulated is None if films is None else films
     clips: Json = {"length": length, "question": question, "films": filmed, "seed": seed, "max_episode_steps": max_episode_steps}
@@ -106,7 +113,7 @@ class _Asked(NamedTuple):
     where: Path
     parts: list[int]
     """Choices of each round."""
-    simulated: Simulated | None
+    simulated: SimulatedRater | None
     learner: Json
     fit: Json
     clips: Json
@@ -135,7 +142,7 @@ class _Work:
             if left:
                 return self._told("waiting", number, left)
             if len(numbered(self._where / REWARDS)) <= number:
-                report = fit_clips(self._where, settings=self._asked.fit, seed=self._seed + number).report
+                report = fit_clips(self._where, settings=self._asked.fit, seed=(self._seed + number) % 2**32).report
                 self._accuracy = report.accuracy
                 right = f"{report.accuracy:.1%} of {report.held_out}" if report.held_out else "none"
                 self._say(f"a reward from {report.choices} choices, right on {right} that were held out")
@@ -155,6 +162,8 @@ class _Work:
             pairs, run = asked.parts[number], _run_in(where)
             collect_clips(asked.environment, where, pairs=pairs, run=run, env_kwargs=asked.env_kwargs, **asked.clips)  # type: ignore[arg-type]
         _keep_plan(where, asked.plan)
+        if number < number_of_collections(where) - 1:
+            return 0
         ask(where, collections(where)[number])
         if asked.simulated is not None:
             judge_clips(where, **asked.simulated._asdict(), seed=self._seed + number)

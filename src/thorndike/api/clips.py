@@ -81,7 +81,7 @@ def collect_clips(
     reward has been learnt there, by how much its members disagree. Raises ``UserError`` for what cannot be recorded or filmed.
     """
     where = Path(to)
-    if pairs < 1 or length < 1 or not 0 <= seed < 2**31:
+    if pairs < 1 or length < 1 or not 0 <= seed < 2**32:
         raise UserError(f"record at least one pair of clips of at least one step; got pairs={pairs}, length={length}, seed={seed}")
     choice = bounded(registry.resolve(environment, env_kwargs=env_kwargs, max_episode_steps=max_episode_steps))
     loaded = None if run is None else run if isinstance(run, LoadedPolicy) else load(run)
@@ -147,8 +147,8 @@ def _record(choice: registry.Choice, loaded: LoadedPolicy | None, wanted: Wanted
 
     def perform(engine: LoopEngine) -> Performer:
         if loaded is None:
-            return AtRandom(engine.spec.action_space, wanted.num_envs, wanted.seed + wanted.number)
-        return Agent(loaded.policy, wanted.num_envs, wanted.seed + wanted.number)
+            return AtRandom(engine.spec.action_space, wanted.num_envs, (wanted.seed, wanted.number))
+        return Agent(loaded.policy, wanted.num_envs, (wanted.seed, wanted.number))
 
     if films is not None:
         films.mkdir(parents=True)

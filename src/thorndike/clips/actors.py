@@ -37,8 +37,9 @@ class Performer(Protocol):
 class AtRandom:
     """Uniform actions, among the allowed ones where there is a mask; of an unbounded Box, standard normal ones."""
 
-    def __init__(self, space: gymnasium.Space, num_envs: int, seed: int) -> None:
-        self._space, self._num_envs, self._dice = space, num_envs, np.random.default_rng([seed, _ACTING])
+    def __init__(self, space: gymnasium.Space, num_envs: int, seeds: tuple[int, int]) -> None:
+        """``seeds``: the run's, and the collection's number."""
+        self._space, self._num_envs, self._dice = space, num_envs, np.random.default_rng([*seeds, _ACTING])
         self._obs: Observation = ()
 
     def begin(self, obs: Observation) -> None:
@@ -81,10 +82,11 @@ class _Held(NamedTuple):
 class Agent:
     """A trained policy, its best seed, acting as it did while it learnt."""
 
-    def __init__(self, policy: Policy, num_envs: int, seed: int) -> None:
+    def __init__(self, policy: Policy, num_envs: int, seeds: tuple[int, int]) -> None:
+        """``seeds``: the run's, and the collection's number."""
         self._moves = acting(policy.algorithm, policy.wrapper, policy.spec.action_space, 1, num_envs)
         self._actor, self._statistics = jax.tree.map(lambda x: x[policy.best : policy.best + 1], (policy.actors, policy.statistics))
-        key = jax.random.fold_in(jax.random.key(seed), _ACTING)
+        key = jax.random.fold_in(jax.random.fold_in(jax.random.key(seeds[0]), _ACTING), seeds[1])
 
         def noise(t: Array) -> PyTree:
             return jax.tree.map(lambda x: x[None, None], policy.noise(jax.random.fold_in(key, t), num_envs))
