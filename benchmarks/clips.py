@@ -55,8 +55,11 @@ def from_choices(environment: str, steps: int, seed: int, error_rate: float, run
 
 def from_reward(environment: str, steps: int, seed: int, runs: Path) -> float:
     """The same learner on the environment's own reward."""
-    run = td.train("ppo", environment, steps=steps, seed=seed, output=runs, name=f"true-{seed}")
-    return td.load(run.run).evaluate(EPISODES).mean
+    kept = runs / f"{environment}-{steps}-true-{seed}.json"
+    if not kept.exists():
+        run = td.train("ppo", environment, steps=steps, seed=seed, output=runs, name=f"true-{seed}")
+        kept.write_text(json.dumps(td.load(run.run).evaluate(EPISODES).mean))
+    return json.loads(kept.read_text())
 
 
 def measure(options: argparse.Namespace, error_rate: float, truth: list[float], by_chance: float) -> dict:
@@ -81,9 +84,8 @@ def tables() -> None:
     lines.append(f"| the true reward | {np.mean(kept['true_reward']):.1f} | {truth} | |")
     for case in kept["cases"]:
         each = ", ".join(f"{row['return']:.0f}" for row in case["rows"])
-        rater = f"{kept['choices']} choices, " + (
-            f"{case['error_rate']:.0%} of them random" if case["error_rate"] else "by Bradley-Terry alone"
-        )
+        how = f"{case['error_rate']:.0%} of them random" if case["error_rate"] else "by Bradley-Terry alone"
+        rater = f"{kept['choices']} choices, {how}"
         lines.append(f"| {rater} | {case['mean']:.1f} | {each} | {case['share']:.1%}, {case['share_worst']:.1%} |")
     lines.append(f"| nothing: random actions | {kept['by_chance']:.1f} | | |")
     before, after = text.split(START)[0], text.split(END)[1]
@@ -103,15 +105,12 @@ def main() -> None:
         by_chance = random_return(options.environment)
         truth = [from_reward(options.environment, options.steps, seed, options.runs) for seed in range(options.seeds)]
         print({"by_chance": round(by_chance, 1), "true_reward": [round(value, 1) for value in truth]}, flush=True)
-        cases = [measure(options, error_rate, truth, by_chance) for error_rate in options.errors]
-        about = {
-            "command": "python benchmarks/clips.py",
-            "commit": commit(ROOT),
-            "processor": processor(),
-            "environment": options.environment,
-        }
-        about |= {"steps": options.steps, "choices": CHOICES, "rounds": ROUNDS, "episodes": EPISODES, "by_chance": by_chance}
-        RESULTS.write_text(json.dumps(about | {"true_reward": truth, "cases": cases}, indent=1) + "\n")
+        about = {"command": "python benchmarks/clips.py", "commit": commit(ROOT), "processor": processor()}
+        about |= {"environment": options.environment, "steps": options.steps, "choices": CHOICES, "rounds": ROUNDS}
+        about |= {"episodes": EPISODES, "by_chance": by_chance, "true_reward": truth, "cases": []}
+        for error_rate in options.errors:
+            about["cases"].append(measure(options, error_rate, truth, by_chance))
+            RESULTS.write_text(json.dumps(about, indent=1) + "\n")
     tables()
 
 
