@@ -1,12 +1,11 @@
 """Arguments that the verbs of language models share; nothing heavy is imported for them."""
 
 import argparse
-import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TypeVar
 
-from thorndike.cli.parser import Parser, positive_whole
+from thorndike.cli.parser import Parser, at_least_zero, positive_whole
 from thorndike.config_fields import fields_in_source
 from thorndike.errors import UserError
 from thorndike.settings import FieldFacts, describe_kind, parse_settings
@@ -32,10 +31,10 @@ def add_device_argument(parser: Parser) -> None:
 
 def add_sampling_arguments(parser: Parser, new_tokens: int) -> None:
     """How tokens are chosen."""
-    parser.add_argument("--temperature", type=_at_least_zero, default=1.0, metavar="T", help="0: always the likeliest token (default: 1)")
+    parser.add_argument("--temperature", type=at_least_zero, default=1.0, metavar="T", help="0: always the likeliest token (default: 1)")
     parser.add_argument("--top-k", type=_whole_at_least_zero, default=0, metavar="K", help="among the K likeliest; 0: all (default: 0)")
     parser.add_argument(
-        "--top-p", type=_at_least_zero, default=1.0, metavar="P", help="among the likeliest that make up P together (default: 1)"
+        "--top-p", type=at_least_zero, default=1.0, metavar="P", help="among the likeliest that make up P together (default: 1)"
     )
     parser.add_argument("--max-new-tokens", type=positive_whole, default=new_tokens, metavar="N", help=f"at most (default: {new_tokens})")
 
@@ -75,16 +74,6 @@ def prepare_device(device: str, model: Path | None) -> None:
             raise UserError(f"{model} is no model: it has no config.json; give a folder as transformers' save_pretrained writes it")
         large = sum(path.stat().st_size for path in model.glob("*.safetensors")) > _LARGE
     choose_device(device, large)
-
-
-def _at_least_zero(text: str) -> float:
-    try:
-        number = float(text)
-    except ValueError:
-        number = math.nan
-    if not 0.0 <= number < math.inf:
-        raise argparse.ArgumentTypeError(f"expected a number of at least 0; got '{text}'")
-    return number
 
 
 def _whole_at_least_zero(text: str) -> int:

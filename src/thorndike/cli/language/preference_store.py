@@ -4,6 +4,7 @@ import argparse
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from thorndike.cli.parser import Parser
@@ -39,6 +40,14 @@ def existing_project(store: "Store", name: str) -> int:
     if name not in projects:
         raise UserError(f"the store has no project '{name}'{did_you_mean(name, projects)}; put something in: thorndike language import")
     return projects[name]
+
+
+def media_folder(where: str, given: Path | None) -> Path:
+    """The folder that a store's clips lie in: where the store is, unless another is given. Raises ``UserError`` for what is none."""
+    media = given if given is not None else Path("." if "://" in where else Path(where).parent)
+    if not media.is_dir():
+        raise UserError(f"--media {media} is not a folder")
+    return media
 
 
 def share(text: str) -> float:
