@@ -49,6 +49,7 @@ class Config:
     total_steps: Annotated[int, AtLeast(1)] = 70  # iterations of PPO, GRPO and RLOO
     episodes: Annotated[int, AtLeast(8)] = 128  # texts of an iteration
     max_new_tokens: Annotated[int, AtLeast(2)] = 24  # tokens of a completion
+    ignore_eos: bool = True  # every text has so many, as in the paper: none is ended early
     learning_rate: Annotated[float, MoreThan(0)] = 3e-4  # of the policies, falling to 0
     target_kl: Annotated[float, MoreThan(0)] = 6.0  # nats a text
     reward_epochs: Annotated[int, AtLeast(1)] = 2  # passes over the ratings
