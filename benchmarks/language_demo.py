@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import cast
 
 RESULTS = Path(__file__).parent / "results" / "language" / "demo.json"
-LEARNERS = ("ppo", "grpo", "rloo", "dpo", "ppo_without_kl")
+LEARNERS = ("ppo", "grpo", "rloo", "dpo", "ppo_without_kl", "ppo_max_kl")
 Found = Mapping[str, object]
 
 

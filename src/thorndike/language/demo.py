@@ -26,16 +26,17 @@ from thorndike.language.decoder import Params
 from thorndike.language.demo_labels import as_comparisons, judge_pairs
 from thorndike.language.demo_reward import learn_from_ratings, rewards_of
 from thorndike.language.learner import State
-from thorndike.language.model import LanguageModel, load_model, save_model
+from thorndike.language.model import LanguageModel, load_model, never_ending, save_model
 from thorndike.language.over_optimisation import Limits
 from thorndike.language.policy_training import Task, train_policy
 from thorndike.language.pretraining import base_model
 from thorndike.language.reward_files import RewardModel, load_reward_model, refuse_if_near_chance, save_reward_model
+from thorndike.language.rewards import Score, checked_scores
 from thorndike.language.rollouts import Prompts
 from thorndike.language.sentiment import Lexicon, Rated, have_reviews, read_lexicon, read_ratings
 from thorndike.language.text_run import MODEL, open_run
 from thorndike.language.tokenizer import Tokenizer
-from thorndike.language.win_rate import Comparison, compare_with_base
+from thorndike.language.win_rate import Comparison, compare_with_base, written_by
 from thorndike.settings import AtLeast, MoreThan, check, settings_of
 from thorndike.training.run_directory import read_lines, write_json
 
@@ -46,15 +47,17 @@ PROMPT_LENGTH = 8
 class Config:
     """How large the demo is."""
 
-    total_steps: Annotated[int, AtLeast(1)] = 70  # iterations of PPO, GRPO and RLOO
+    total_steps: Annotated[int, AtLeast(1)] = 50  # iterations of PPO, GRPO and RLOO
     episodes: Annotated[int, AtLeast(8)] = 128  # texts of an iteration
     max_new_tokens: Annotated[int, AtLeast(2)] = 24  # tokens of a completion
     ignore_eos: bool = True  # every text has so many, as in the paper: none is ended early
     learning_rate: Annotated[float, MoreThan(0)] = 3e-4  # of the policies, falling to 0
     target_kl: Annotated[float, MoreThan(0)] = 6.0  # nats a text
     reward_epochs: Annotated[int, AtLeast(1)] = 2  # passes over the ratings
-    reward_members: Annotated[int, AtLeast(1)] = 2  # reward models whose mean is the reward
-    pairs: Annotated[int, AtLeast(1)] = 3000  # of texts that the crowd judges
+    reward_members: Annotated[int, AtLeast(1)] = 1  # reward models whose mean is the reward; of several, disagreement is watched
+    pairs: Annotated[int, AtLeast(1)] = 6000  # of texts that the crowd judges
+    dpo_learning_rate: Annotated[float, MoreThan(0)] = 5e-4  # of DPO, which takes one pass over the pairs, falling to 0
+    max_kl: Annotated[float, MoreThan(0)] = 20.0  # nats a text beyond which a policy is stopped
     held_out: Annotated[int, AtLeast(1)] = 512  # prompts that policy and base are compared on
 
     def __post_init__(self) -> None:
@@ -108,6 +111,7 @@ def demo(out: Path, base: Path | None, config: Config, learners: Sequence[str], 
 
 def run_demo(out: Path, data: Data, config: Config, learners: Sequence[str], seed: int, tell: Tell) -> dict[str, object]:
     """All stages; what was found, as ``report.json`` holds it."""
+    data = data._replace(base=never_ending(data.base)) if config.ignore_eos else data
     # Not the learners: another may be added to what is there.
     open_run(out, {"verb": "demo", "seed": seed, "settings": settings_of(config)})
     began = time.perf_counter()
@@ -160,7 +164,8 @@ def _reward(out: Path, data: Data, config: Config, seed: int, tell: Tell) -> Rew
         prompts = _some(data.train, 256)
         samples = sample_many(data.base, prompts, _nothing, 2, max_new_tokens=config.max_new_tokens, seed=seed + 1, batch_size=64)
         model = learn_from_ratings(
-            data.base, data.rated, samples.written, epochs=config.reward_epochs, members=config.reward_members, seed=seed,
+            data.base, data.rated, samples.written, width=config.max_new_tokens + 1, epochs=config.reward_epochs,
+            members=config.reward_members, seed=seed,
             log=lambda step, metrics: tell(f"reward model, step {step}: loss {metrics['train/loss'][0]:.3f}") if step % 20 == 0 else None,
         )  # fmt: skip
         save_reward_model(model, folder)
@@ -181,9 +186,8 @@ def _best_of_n(data: Data, model: RewardModel, config: Config, seed: int) -> dic
 def _policy(out: Path, data: Data, model: RewardModel, config: Config, name: str, seed: int, tell: Tell) -> dict[str, object]:
     """Train by one learner, and compare what came of it with the base."""
     score, _ = rewards_of(model, data.base, PROMPT_LENGTH)
-    told: dict[str, object]
     if name == "dpo":
-        params, told = _by_dpo(data, config, seed), {}
+        params, told = _by_dpo(data, score, config, seed)
     else:
         params, told = _by_rewards(out / name, data, model, config, name, seed, tell)
     found = compare_with_base(
@@ -199,11 +203,9 @@ def _by_rewards(
     run: Path, data: Data, model: RewardModel, config: Config, name: str, seed: int, tell: Tell
 ) -> tuple[Params, dict[str, object]]:
     score, members = rewards_of(model, data.base, PROMPT_LENGTH)
-    base, limits = data.base, Limits(max_kl=20.0)
+    base, limits = data.base, Limits(None, None, None, None) if name == "ppo_without_kl" else Limits(config.max_kl)
     if name.startswith("ppo"):
-        free = name == "ppo_without_kl"
-        limits = Limits(None, None, None, None) if free else limits
-        of_ppo = _ppo_settings(config, free)
+        of_ppo = _ppo_settings(config, free=name in ("ppo_without_kl", "ppo_max_kl"))
         settings: proximal.Config | groups.Config = of_ppo
         learner = proximal.ppo(of_ppo, base.config, base.params)
     else:
@@ -212,7 +214,7 @@ def _by_rewards(
     open_run(run, {"verb": name, "seed": seed, "settings": settings_of(settings)})
 
     def follow(step: int, values: dict[str, float]) -> None:
-        if step % 10 == 0:
+        if step % 5 == 0:
             tell(f"{name}, step {step}: proxy {values['objective/score']:.2f}, gold {values['objective/gold']:.2f}, "
                  f"{values['objective/kl']:.1f} nats")  # fmt: skip
 
@@ -267,20 +269,31 @@ def _curve(run: Path) -> list[dict[str, float]]:
     return [{"step": float(str(row["steps"]))} | {name: cast(list[float], row[f"objective/{name}"])[0] for name in names} for row in rows]
 
 
-def _by_dpo(data: Data, config: Config, seed: int) -> Params:
+def _by_dpo(data: Data, score: Score, config: Config, seed: int) -> tuple[Params, dict[str, object]]:
     comparisons, _ = _labels(data, config, seed)
     pairs = comparison_data(comparisons, data.base.tokenizer.pad_id, PROMPT_LENGTH + config.max_new_tokens)
     reference = direct.reference_log_probs(data.base.params, data.base.config, pairs, 64)
     size = min(64, len(comparisons))
     steps = max(1, len(comparisons) // size)
-    settings = direct.Config(total_steps=steps, batch_size=size, learning_rate="linear(1e-4, 0)", beta=0.05)
+    settings = direct.Config(total_steps=steps, batch_size=size, learning_rate=f"linear({config.dpo_learning_rate}, 0)", beta=0.05)
     learner = direct.dpo(settings, data.base.config)
     state: State = learner.init(data.base.params, jax.random.key(seed))
     update, order = jax.jit(learner.update, donate_argnums=0), np.random.default_rng(seed).permutation(len(comparisons))
+    points = []
     for step in range(steps):
         rows = order[step * size : (step + 1) * size]
         state, _ = update(state, (), direct.Batch(pairs.rows(rows), jnp.asarray(reference[rows])))
-    return learner.params(state, data.base.params)
+        if (step + 1) * 4 // steps > step * 4 // steps:
+            points.append(_point(data, learner.params(state, data.base.params), score, config, seed, step + 1))
+    return learner.params(state, data.base.params), {"iterations": steps, "stopped": None, "curve": points}
+
+
+def _point(data: Data, params: Params, score: Score, config: Config, seed: int, step: int) -> dict[str, float]:
+    """Proxy, gold and divergence of texts that the policy writes now."""
+    key = jax.random.fold_in(jax.random.key(seed), step)
+    written, kl, _ = written_by(data.base, params, _some(data.train, 256), key, config.max_new_tokens, 1.0, 128)
+    proxy, gold = (checked_scores(each, written.prompts, written.completions, written.ids) for each in (score, data.gold.score))
+    return {"step": float(step), "score": float(proxy.mean()), "gold": float(gold.mean()), "kl": kl}
 
 
 def _comparison(found: Comparison) -> dict[str, object]:
