@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import jax
+import numpy as np
 import pytest
 
 from thorndike.cli.main import main
@@ -68,6 +69,13 @@ def test_a_policy_is_trained_on_it_and_compared(verb: str, folder: Path, reward:
     assert answer(capsys, *words) == found  # the same command finds it done
 
 
+def test_no_text_ends_where_the_policy_is_told_so(folder: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    words = ["ppo", str(folder / "base"), "--reward", f"{folder}/rewards.py:length", "--prompts", str(folder / "prompts.jsonl")]
+    found = answer(capsys, *words, "--out", str(tmp_path / "ppo"), *SMALL, "--set=ignore_eos=true")
+    assert found["length"] == found["base_length"] == 4.0
+    assert load_model(tmp_path / "ppo" / "model").config == load_model(folder / "base").config
+
+
 def test_dpo_and_eval(folder: Path, reward: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["dpo", str(folder / "base"), "--data", str(folder / "preferences.jsonl"), "--out", str(folder / "dpo")]
     found = answer(capsys, *words, "--set=batch_size=8", "--set=learning_rate=0.01", "--set=total_steps=12")
@@ -75,6 +83,23 @@ def test_dpo_and_eval(folder: Path, reward: Path, capsys: pytest.CaptureFixture[
     words = ["eval", str(folder / "dpo" / "model"), "--base", str(folder / "base"), "--prompts", str(folder / "prompts.jsonl")]
     seen = answer(capsys, *words, "--reward", str(reward), "--reward", f"{folder}/rewards.py:length", "--max-new-tokens", "4")
     assert seen["kl"] > 0.01 and set(seen["judged"]) == {str(reward), f"{folder}/rewards.py:length"} and seen["prompts"] == 4
+
+
+def test_the_best_samples_are_learnt_from(folder: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    base, prompts, reward = str(folder / "base"), str(folder / "prompts.jsonl"), f"{folder}/rewards.py:length"
+    ends = ["--max-new-tokens", "6", "--ignore-eos"]
+    words = ["generate", base, "--prompts", prompts, *ends, "--samples", "12", "--to", str(tmp_path / "best.jsonl")]
+    assert answer(capsys, *words, "--reward", reward)["prompts"] == 4
+    rows = [json.loads(line) for line in (tmp_path / "best.jsonl").read_text().splitlines()]
+    assert all(row["reward"] == len(row["completion"]) for row in rows)
+    every = answer(capsys, *words[:-2], "--seed", "1")["rows"]
+    assert np.mean([row["reward"] for row in rows]) > np.mean([len(text) for row in every for text in row["completions"]]) + 1
+    words = ["sft", base, "--data", str(tmp_path / "best.jsonl"), "--out", str(tmp_path / "sft"), "--set=total_steps=30"]
+    answer(capsys, *words, "--set=batch_size=4", "--set=learning_rate=0.02", "--set=max_length=32")
+    words = ["eval", str(tmp_path / "sft" / "model"), "--base", base, "--prompts", prompts, *ends, "--reward", reward]
+    found = answer(capsys, *words)
+    assert found["length"] == found["base_length"] == 6.0 and found["kl"] > 0.1
+    assert found["judged"][reward]["policy"] > found["judged"][reward]["base"] + 1
 
 
 def test_mistakes_are_one_line(folder: Path, reward: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -92,6 +117,8 @@ def test_mistakes_are_one_line(folder: Path, reward: Path, capsys: pytest.Captur
         ([*ppo, "--reward", str(reward), "--max-kl", "-1"], "above 0"),
         ([*ppo, "--reward", str(reward), "--set", "target_kll=3"], "did you mean"),
         (["rloo", *ppo[1:], "--reward", str(reward), "--set", "baseline=group"], "thorndike language grpo"),
+        (["generate", base, "--prompts", prompts, "--reward", str(reward), "--top-k", "3"], "leave --top-k, --top-p"),
+        ([*ppo, "--reward", str(reward), "--set", "ignore_eos=true", "--set", "missing_eos_penalty=1"], "would charge all"),
         (["dpo", base, "--data", str(tmp_path / "same.jsonl"), "--out", str(tmp_path / "y")], "same.jsonl, row 1: chosen and rejected"),
         (["dpo", base, "--data", str(tmp_path / "odd.jsonl"), "--out", str(tmp_path / "y")], "odd.jsonl, row 1: p_chosen is 2"),
         (["reward", base, "--data", prompts, "--out", str(tmp_path / "y")], "expected a preference"),

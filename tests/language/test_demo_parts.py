@@ -17,6 +17,7 @@ from thorndike.language import best_of_n, sentiment
 from thorndike.language.best_of_n import Samples, best, chances, sample_many
 from thorndike.language.demo_labels import as_comparisons, judge_pairs
 from thorndike.language.demo_report import write_report
+from thorndike.language.demo_reward import opinions, window
 from thorndike.language.model import LanguageModel, load_decoder
 from thorndike.language.rollouts import Prompts, Written
 from thorndike.language.tokenizer import load_tokenizer
@@ -27,6 +28,7 @@ pytestmark = pytest.mark.usefixtures("quick_compile")
 CONFIG, PARAMS = load_decoder(REFERENCE / "llama")
 BASE = LanguageModel(CONFIG, PARAMS, load_tokenizer(REFERENCE / "tokenizer"))
 TOKENS = np.random.default_rng(0).integers(10, 90, (6, 4)).astype(np.int32)
+LEARNERS = ("ppo", "grpo", "rloo", "dpo", "ppo_without_kl", "ppo_max_kl")
 PROMPTS = Prompts(TOKENS, np.ones_like(TOKENS), tuple("abcdef"))
 
 
@@ -49,6 +51,9 @@ def package() -> bytes:
         "hutto_ICWSM_2014/movieReviewSnippets_GroundTruth.txt": texts,
         "hutto_ICWSM_2014/movieReviewSnippets_anonDataRatings.txt": ratings,
     }
+    for name in ("amazonReviewSnippets", "nytEditorialSnippets", "tweets"):
+        inner |= {f"hutto_ICWSM_2014/{name}_GroundTruth.txt": f"1\t1\tSome {name}\n"}
+        inner |= {f"hutto_ICWSM_2014/{name}_anonDataRatings.txt": "1\t1\t0\t[1]\n"}
     lexicon = "good\t1.9\t0.9\t[2, 1]\nbad\t-2.5\t0.6\t[-3, -2]\n:)\t2.0\t1.1\t[2, 2]\nfine\t0.8\t0.6\t[1, 1]\n"
     outer = {"additional_resources/hutto_ICWSM_2014.tar.gz": archive({name: text.encode() for name, text in inner.items()})}
     outer["vaderSentiment/vader_lexicon.txt"] = lexicon.encode()
@@ -56,7 +61,11 @@ def package() -> bytes:
 
 
 def test_ratings_and_words_are_read(package: bytes) -> None:
-    assert sentiment.read_ratings(package) == [sentiment.Rated("A fine film.", (3, 2)), sentiment.Rated("It drags", (-1, -1, -1))]
+    films, others = sentiment.read_ratings(package)[:2], sentiment.read_ratings(package)[2:]
+    assert films == [sentiment.Rated("A fine film.", (3, 2), "film"), sentiment.Rated("It drags", (-1, -1, -1), "film")]
+    assert [(each.source, each.text) for each in others] == [
+        ("product", "Some amazonReviewSnippets"), ("newspaper", "Some nytEditorialSnippets"), ("tweet", "Some tweets"),
+    ]  # fmt: skip
     lexicon = sentiment.read_lexicon(package)
     assert dict(lexicon.valence) == {"good": 1.9, "bad": -2.5, "fine": 0.8}
     with pytest.raises(UserError, match="has no vaderSentiment"):
@@ -92,6 +101,27 @@ def test_a_package_is_fetched_once_and_checked(monkeypatch: pytest.MonkeyPatch, 
     monkeypatch.setattr(sentiment.subprocess, "run", lambda command, **how: subprocess.CompletedProcess(command, 1, "", "x\nno network"))
     with pytest.raises(UserError, match=r"cannot be fetched \(no network\): put thing-1.tar.gz from PyPI into"):
         sentiment.fetched(wanted)
+
+
+def test_what_is_said_of_two_snippets_is_counted_over_all_their_raters() -> None:
+    ratings = [(3, 2, 2), (2, -1), (0,), (0, 0, 5)]
+    first, second = np.triu_indices(4, k=1)
+    label, weight = opinions(ratings, first, second)
+    for place, (a, b) in enumerate(zip(first, second, strict=True)):
+        asked = [np.sign(min(x, 4) - min(y, 4)) for x in ratings[a] for y in ratings[b]]
+        ahead, behind = asked.count(1), asked.count(-1)
+        assert weight[place] == pytest.approx((ahead + behind) / len(asked))
+        assert label[place] == pytest.approx(ahead / (ahead + behind) if ahead + behind else 0.5)
+
+
+def test_windows_begin_anywhere_and_are_texts_of_their_own() -> None:
+    generator, bos = np.random.default_rng(0), BASE.tokenizer.bos_id
+    text = [bos, *range(10, 30)] if bos is not None else [*range(10, 30)]
+    seen = {tuple(window(text, 6, BASE, generator)) for _ in range(400)}
+    inside = text[1:] if bos is not None else text
+    size = 6 - (bos is not None)
+    assert seen == {(*text[: 6 - size], *inside[start : start + size]) for start in range(len(inside) - size + 1)}
+    assert window(text[:6], 6, BASE, generator) == text[:6]
 
 
 def test_the_crowd_is_seen_through() -> None:
@@ -213,10 +243,12 @@ def test_the_demo_from_end_to_end_goes_on_where_it_stopped(tmp_path: Path, monke
     data = demo.Data(base, train, held_out, rated, sentiment.Lexicon({"good": 2.0, "bad": -2.0, "fine": 1.0}))
     small = demo.Config(total_steps=2, episodes=16, max_new_tokens=4, reward_epochs=8, pairs=40, held_out=16)
     lines: list[str] = []
-    found = demo.run_demo(tmp_path / "run", data, small, ("ppo", "grpo", "rloo", "dpo", "ppo_without_kl"), 0, lines.append)
-    assert {"labels", "reward", "best_of_n", "ppo", "grpo", "rloo", "dpo", "ppo_without_kl"} <= set(found)
+    found = demo.run_demo(tmp_path / "run", data, small, LEARNERS, 0, lines.append)
+    assert {"labels", "reward", "best_of_n", *LEARNERS} <= set(found)
+    assert all(found[name]["length"] == found[name]["base_length"] == 4.0 for name in LEARNERS)
+    assert found["dpo"]["curve"][-1]["step"] == found["dpo"]["iterations"] and found["dpo"]["curve"][-1]["kl"] > 0.0
     assert (tmp_path / "run" / "ppo" / "model" / "config.json").is_file()
-    again = demo.run_demo(tmp_path / "run", data, small, ("ppo", "grpo", "rloo", "dpo", "ppo_without_kl"), 0, lines.append)
+    again = demo.run_demo(tmp_path / "run", data, small, LEARNERS, 0, lines.append)
     assert {name: part for name, part in again.items() if name != "wall_s"} == {
         name: part for name, part in found.items() if name not in ("wall_s",)
     }

@@ -1,5 +1,6 @@
 """Generation: log-probabilities, early end, samples a prompt, streaming, padding."""
 
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -9,7 +10,7 @@ import pytest
 
 from language.make_reference import REFERENCE
 from thorndike.errors import UserError
-from thorndike.language.decoder import hidden_states, token_log_probs
+from thorndike.language.decoder import hidden_states, logits, token_log_probs
 from thorndike.language.generation import (
     AS_TRAINED,
     GREEDY,
@@ -19,17 +20,17 @@ from thorndike.language.generation import (
     generate,
     generate_texts,
     left_padded,
-    stop_tokens,
     stream,
     stream_text,
 )
-from thorndike.language.model import LanguageModel, load_decoder
+from thorndike.language.model import LanguageModel, load_decoder, never_ending, stop_tokens
 from thorndike.language.tokenizer import load_tokenizer
 
 pytestmark = pytest.mark.usefixtures("quick_compile")
 CONFIG, PARAMS = load_decoder(REFERENCE / "llama")
 PROMPTS = [[5, 6, 7], [9], [20, 21, 22, 23, 24]]
 NEW = 12
+STOPS = (10, 30, 50)
 
 
 def run(sampling: Sampling = AS_TRAINED, stops: tuple[int, ...] = (), samples: int = 1, seed: int = 0) -> Generated:
@@ -111,6 +112,26 @@ def test_texts_go_in_and_come_out() -> None:
     whole = generate_texts(model, prompts[:1], max_new_tokens=NEW, sampling=GREEDY)[0][0]
     streamed = "".join(stream_text(model, model.tokenizer.encode(prompts[0]), max_new_tokens=NEW, sampling=GREEDY))
     assert whole.rstrip("\ufffd") == streamed
+
+
+def test_a_model_that_never_ends_has_what_is_left_of_its_distribution() -> None:
+    model = LanguageModel(replace(CONFIG, eos_token_ids=STOPS), PARAMS, load_tokenizer(REFERENCE / "tokenizer"))
+    endless = never_ending(model).config
+    tokens, segments = left_padded([[5, 6, 7]] * 64, 0)
+    found = generate(PARAMS, endless, tokens, segments, jax.random.key(0), max_new_tokens=NEW, stop_tokens=stop_tokens(model), pad_id=0)
+    written = np.asarray(found.tokens)
+    assert not np.isin(written, stop_tokens(model)).any() and (np.asarray(found.lengths) == NEW).all() and not found.ended.any()
+    texts = jnp.concatenate([tokens[:, -3:], found.tokens], axis=1)
+    hidden = hidden_states(PARAMS, CONFIG, texts)[:, 2:-1]
+    whole, left = np.exp(np.asarray(logits(PARAMS, CONFIG, hidden), np.float64)), np.asarray(logits(PARAMS, endless, hidden))
+    kept = [token for token in range(whole.shape[-1]) if token not in stop_tokens(model)]
+    by_reading = np.asarray(token_log_probs(PARAMS, endless, hidden, found.tokens))
+    assert (left[..., list(stop_tokens(model))] < -1e29).all()
+    for row in range(0, 64, 9):
+        for t in range(NEW):
+            wanted = np.log(whole[row, t, written[row, t]] / whole[row, t, kept].sum())
+            assert float(found.log_probs[row, t]) == pytest.approx(wanted, abs=1e-4)
+            assert float(by_reading[row, t]) == pytest.approx(wanted, abs=1e-4)
 
 
 def test_prompts_are_padded_on_the_left_to_one_of_a_few_lengths() -> None:

@@ -17,7 +17,7 @@ from thorndike.language import ppo as proximal
 from thorndike.language.comparisons import comparison_data, preferred
 from thorndike.language.decoder import hidden_states, logits
 from thorndike.language.lora import LoraConfig
-from thorndike.language.model import LanguageModel, load_decoder
+from thorndike.language.model import LanguageModel, load_decoder, never_ending
 from thorndike.language.over_optimisation import Limits, Signals, Watch, repetition, trouble, watched
 from thorndike.language.policy_descent import check_ratio
 from thorndike.language.policy_training import Task, train_policy
@@ -178,6 +178,24 @@ def test_a_policy_learns_what_is_rewarded(name, tmp_path):
     assert [line["steps"] for line in lines] == list(range(1, 9)) and list(run.glob("events.out.tfevents.*"))
 
 
+@pytest.mark.parametrize("name", ["separate", "grpo"])
+def test_texts_that_never_end_are_learnt_from_as_they_were_sampled(name, tmp_path):
+    endless, config = never_ending(BASE), replace(loop_config(name), total_steps=3, learning_rate=3e-2, ignore_eos=True)
+    built = proximal.ppo(config, endless.config, PARAMS) if name == "separate" else groups.grpo(config, endless.config, PARAMS)
+    run, seen, rows = start(tmp_path, name), [], []
+
+    def score(prompts, completions, ids):
+        rows.extend(ids)
+        return by_token(prompts, completions, ids)
+
+    outcome = train_policy(Task(endless, PROMPTS, score), built, config, run, limits=FREE, told=lambda step, values: seen.append(values))
+    assert all(values["rollout/ep_len_mean"] == N and values["rollout/ended"] == 0.0 for values in seen)
+    assert all(values["train/first_ratio_error"] < 1e-4 and values["train/log_prob_gap"] < 1e-4 for values in seen)
+    assert (
+        not any(STOP in row[-N:] for row in rows) and outcome.kl > 0.01 and all(np.isfinite(list(values.values())).all() for values in seen)
+    )
+
+
 def numbers(run: Path) -> list[dict]:
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     return [{name: value for name, value in line.items() if name != "wall_s"} for line in lines]
@@ -282,6 +300,8 @@ def test_dpo_makes_the_better_one_likelier(loss):
     [
         (proximal.Config, {"batch_size": 48}, "do not divide into minibatches"),
         (proximal.Config, {"temperature": 0.0}, "temperature"),
+        (proximal.Config, {"ignore_eos": True, "missing_eos_penalty": 1.0}, "would charge all of them"),
+        (groups.Config, {"ignore_eos": True, "missing_eos_penalty": 1.0}, "would charge all of them"),
         (groups.Config, {"group": 5}, "groups of 5"),
         (groups.Config, {"gradient_accumulation": 5}, "parts"),
         (direct.Config, {"loss": "ipo", "label_smoothing": 0.1}, "takes no label_smoothing"),

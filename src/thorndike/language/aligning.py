@@ -13,11 +13,11 @@ from thorndike.errors import UserError
 from thorndike.language import dpo as direct
 from thorndike.language import grpo as groups
 from thorndike.language import ppo as proximal
-from thorndike.language.best_of_n import sample_many
+from thorndike.language.best_of_n import best, sample_many
 from thorndike.language.comparisons import ComparisonData, comparison_data
 from thorndike.language.learner import State
 from thorndike.language.lora import LoraConfig
-from thorndike.language.model import LanguageModel, load_model, save_model
+from thorndike.language.model import LanguageModel, load_model, never_ending, save_model
 from thorndike.language.over_optimisation import Limits
 from thorndike.language.policy_learner import PolicyLearner
 from thorndike.language.policy_training import Outcome, Task, Told, train_policy
@@ -119,16 +119,18 @@ def align(
 
     A tenth of the prompts (at most 256) is kept to compare with the base on, in ``comparison.json`` with samples of both.
     """
-    base = load_model(folder)
-    reward = load_rewards(rewards, base)
     config: proximal.Config | groups.Config
-    built: PolicyLearner
     if learner == "ppo":
         config = configured(proximal.Config, settings)
+    else:
+        config = configured(groups.Config, {**settings, **({"baseline": "leave_one_out"} if learner == "rloo" else {})})
+    base = load_model(folder)
+    base = never_ending(base) if config.ignore_eos else base
+    reward = load_rewards(rewards, base)
+    built: PolicyLearner
+    if isinstance(config, proximal.Config):
         built = proximal.ppo(config, base.config, base.params, _value_params(reward, base), lora)
     else:
-        extra = {"baseline": "leave_one_out"} if learner == "rloo" else {}
-        config = configured(groups.Config, {**settings, **extra})
         built = groups.grpo(config, base.config, base.params, lora)
     texts = read_prompts(prompts)
     kept = min(256, len(texts) // 10) or 1
@@ -187,10 +189,15 @@ def align_by_preferences(
 
 
 def compare_folders(
-    base: Path, policy: Path, prompts: Sequence[Path], scores: Sequence[Reward], *, max_new_tokens: int, temperature: float, seed: int
-) -> Comparison:
-    """A policy beside its base, by every score on its own. Raises ``UserError`` if they are not of one shape."""
+    base: Path, policy: Path, prompts: Sequence[Path], scores: Sequence[Reward], *, max_new_tokens: int, temperature: float, seed: int,
+    ignore_eos: bool = False,
+) -> Comparison:  # fmt: skip
+    """A policy beside its base, by every score on its own; with ``ignore_eos`` no text of either ends before its limit.
+
+    Raises ``UserError`` if they are not of one shape.
+    """
     first, second = load_model(base), load_model(policy)
+    first = never_ending(first) if ignore_eos else first
     if jax.tree.map(jnp.shape, first.params) != jax.tree.map(jnp.shape, second.params):
         raise UserError(f"{policy} is not of the shape of {base}: their divergence has no meaning; compare a policy with what it began as")
     texts = read_prompts(prompts)
@@ -200,6 +207,25 @@ def compare_folders(
         first, second.params, make_prompts(texts, first.tokenizer, width), named, max_new_tokens=max_new_tokens, temperature=temperature,
         seed=seed,
     )  # fmt: skip
+
+
+def best_completions(
+    folder: Path, rewards: Sequence[Reward], prompts: Sequence[str], samples: int, *, max_new_tokens: int, temperature: float, seed: int,
+    ignore_eos: bool = False, batch_size: int = 16,
+) -> list[dict[str, object]]:  # fmt: skip
+    """Of each prompt's samples the one of the highest reward, as rows that ``sft`` learns from: prompt, completion and its reward."""
+    base = load_model(folder)
+    base = never_ending(base) if ignore_eos else base
+    score = load_rewards(rewards, base).score
+    width = max(len(tokens) for tokens in base.tokenizer.encode_many(prompts))
+    found = sample_many(
+        base, make_prompts(prompts, base.tokenizer, width), score, samples, max_new_tokens=max_new_tokens, temperature=temperature,
+        seed=seed, batch_size=batch_size,
+    )  # fmt: skip
+    return [
+        {"prompt": prompt, "completion": found.written.completions[row * samples + place], "reward": float(found.proxy[row, place])}
+        for row, (prompt, place) in enumerate(zip(prompts, best(found).tolist(), strict=True))
+    ]
 
 
 def as_json(found: Comparison) -> dict[str, object]:

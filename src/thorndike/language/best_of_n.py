@@ -12,8 +12,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from thorndike.language.generation import stop_tokens
-from thorndike.language.model import LanguageModel
+from thorndike.language.model import LanguageModel, stop_tokens
 from thorndike.language.rewards import Score, checked_scores
 from thorndike.language.rollouts import Prompts, Written, as_written, sample_rollout
 

@@ -30,6 +30,8 @@ _ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
     "gelu_tanh": partial(jax.nn.gelu, approximate=True),
     "relu": jax.nn.relu,
 }
+_NEVER = -1e30
+"""The score of a token that is never chosen; not infinite, so that divergences and gradients are numbers."""
 _CHUNK = 2**24
 """Logits that are in memory at once."""
 
@@ -154,7 +156,10 @@ def logits(params: Params, config: ModelConfig, hidden: Float[Array, "*rows d"])
     table = output_table(params, config)
     flat = hidden.reshape(-1, hidden.shape[-1])
     scores = jax.lax.dot_general(flat, table.astype(flat.dtype), (((1,), (1,)), ((), ())), preferred_element_type=jnp.float32)
-    return _capped(scores, config.logit_soft_cap).reshape(*hidden.shape[:-1], -1)
+    scores = _capped(scores, config.logit_soft_cap)
+    if config.never_chosen:
+        scores = scores.at[:, jnp.asarray(config.never_chosen)].set(_NEVER)
+    return scores.reshape(*hidden.shape[:-1], -1)
 
 
 def token_log_probs(
@@ -162,7 +167,8 @@ def token_log_probs(
 ) -> Float[Array, "*rows"]:
     """``log pi(target)`` of each row, at a temperature.
 
-    The target's logit is a product of two rows: picking it out of all logits costs their size once more, in both directions.
+    The target's logit is a product of two rows: picking it out of all logits costs their size once more, in both directions. A target that
+    the config never chooses has no meaning here.
     """
     table = output_table(params, config)
 

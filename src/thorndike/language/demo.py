@@ -7,7 +7,7 @@ import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, NamedTuple, cast
 
@@ -20,22 +20,24 @@ from thorndike.language import dpo as direct
 from thorndike.language import grpo as groups
 from thorndike.language import ppo as proximal
 from thorndike.language.best_of_n import curve, sample_many
+from thorndike.language.comparisons import Comparison as PairOfTexts
 from thorndike.language.comparisons import comparison_data
 from thorndike.language.corpus import MOVIE_REVIEWS, read_corpus
 from thorndike.language.decoder import Params
 from thorndike.language.demo_labels import as_comparisons, judge_pairs
 from thorndike.language.demo_reward import learn_from_ratings, rewards_of
 from thorndike.language.learner import State
-from thorndike.language.model import LanguageModel, load_model, save_model
+from thorndike.language.model import LanguageModel, load_model, never_ending, save_model
 from thorndike.language.over_optimisation import Limits
 from thorndike.language.policy_training import Task, train_policy
 from thorndike.language.pretraining import base_model
 from thorndike.language.reward_files import RewardModel, load_reward_model, refuse_if_near_chance, save_reward_model
+from thorndike.language.rewards import Score, checked_scores
 from thorndike.language.rollouts import Prompts
 from thorndike.language.sentiment import Lexicon, Rated, have_reviews, read_lexicon, read_ratings
 from thorndike.language.text_run import MODEL, open_run
 from thorndike.language.tokenizer import Tokenizer
-from thorndike.language.win_rate import Comparison, compare_with_base
+from thorndike.language.win_rate import Comparison, compare_with_base, written_by
 from thorndike.settings import AtLeast, MoreThan, check, settings_of
 from thorndike.training.run_directory import read_lines, write_json
 
@@ -46,14 +48,19 @@ PROMPT_LENGTH = 8
 class Config:
     """How large the demo is."""
 
-    total_steps: Annotated[int, AtLeast(1)] = 70  # iterations of PPO, GRPO and RLOO
+    total_steps: Annotated[int, AtLeast(1)] = 50  # iterations of PPO, GRPO and RLOO
     episodes: Annotated[int, AtLeast(8)] = 128  # texts of an iteration
     max_new_tokens: Annotated[int, AtLeast(2)] = 24  # tokens of a completion
+    ignore_eos: bool = True  # every text has so many, as in the paper: none is ended early
     learning_rate: Annotated[float, MoreThan(0)] = 3e-4  # of the policies, falling to 0
-    target_kl: Annotated[float, MoreThan(0)] = 6.0  # nats a text
-    reward_epochs: Annotated[int, AtLeast(1)] = 2  # passes over the ratings
-    reward_members: Annotated[int, AtLeast(1)] = 2  # reward models whose mean is the reward
-    pairs: Annotated[int, AtLeast(1)] = 3000  # of texts that the crowd judges
+    kl_coefficient: Annotated[float, MoreThan(0)] = 0.3  # of the penalty, at first
+    target_kl: Annotated[float, MoreThan(0)] = 6.0  # nats a text that the coefficient is steered to
+    kl_horizon: Annotated[float, MoreThan(0)] = 800.0  # episodes over which it follows
+    reward_epochs: Annotated[int, AtLeast(1)] = 1  # passes over the ratings
+    reward_members: Annotated[int, AtLeast(1)] = 1  # reward models whose mean is the reward; of several, disagreement is watched
+    pairs: Annotated[int, AtLeast(1)] = 6000  # of texts that the crowd judges
+    dpo_learning_rate: Annotated[float, MoreThan(0)] = 5e-4  # of DPO, which takes one pass over the pairs, falling to 0
+    max_kl: Annotated[float, MoreThan(0)] = 20.0  # nats a text beyond which a policy is stopped
     held_out: Annotated[int, AtLeast(1)] = 512  # prompts that policy and base are compared on
 
     def __post_init__(self) -> None:
@@ -71,6 +78,8 @@ class Data(NamedTuple):
 
 
 Tell = Callable[[str], None]
+Judged = Callable[[], tuple[list[PairOfTexts], dict[str, object]]]
+"""What the crowd says of pairs of texts, made when it is first asked for, and how good that is."""
 
 
 def review_prompts(texts: Sequence[str], tokenizer: Tokenizer, held_out: int) -> tuple[Prompts, Prompts]:
@@ -107,19 +116,20 @@ def demo(out: Path, base: Path | None, config: Config, learners: Sequence[str], 
 
 def run_demo(out: Path, data: Data, config: Config, learners: Sequence[str], seed: int, tell: Tell) -> dict[str, object]:
     """All stages; what was found, as ``report.json`` holds it."""
+    data = data._replace(base=never_ending(data.base)) if config.ignore_eos else data
     # Not the learners: another may be added to what is there.
     open_run(out, {"verb": "demo", "seed": seed, "settings": settings_of(config)})
     began = time.perf_counter()
     found: dict[str, object] = {"seed": seed}
     kept = Kept(out, tell)
-    found["labels"] = kept.stage("labels", lambda: _labels(data, config, seed)[1])
-    model = _reward(out, data, config, seed, tell)
-    held_out = model.held_out
-    found["reward"] = None if held_out is None else held_out._asdict() | {"near_chance": held_out.near_chance}
+    judged = cache(lambda: _labels(data, config, seed))
+    found["labels"] = kept.stage("labels", lambda: judged()[1])
+    found["reward"] = kept.stage("reward", lambda: _reward(out / "reward", data, config, seed, tell))
+    model = load_reward_model(out / "reward")
     refuse_if_near_chance(model)
     found["best_of_n"] = kept.stage("best_of_n", lambda: _best_of_n(data, model, config, seed))
     for learner in learners:
-        found[learner] = kept.stage(learner, partial(_policy, out, data, model, config, learner, seed, tell))
+        found[learner] = kept.stage(learner, partial(_policy, out, data, model, judged, config, learner, seed, tell))
     found["wall_s"] = time.perf_counter() - began
     write_json(out / "report.json", found)
     return found
@@ -137,14 +147,14 @@ class Kept:
         """What a stage found, made now unless it was made before."""
         path = self._folder / f"{name}.json"
         if not path.exists():
-            began = time.perf_counter()
-            write_json(path, {**make(), "wall_s": time.perf_counter() - began})
+            began, began_cpu = time.perf_counter(), time.process_time()
+            write_json(path, {**make(), "wall_s": time.perf_counter() - began, "cpu_s": time.process_time() - began_cpu})
         content = json.loads(path.read_text(encoding="utf-8"))
         self._tell(f"{name}: {_in_short(content)}")
         return content
 
 
-def _labels(data: Data, config: Config, seed: int) -> tuple[list, dict[str, object]]:
+def _labels(data: Data, config: Config, seed: int) -> tuple[list[PairOfTexts], dict[str, object]]:
     """Pairs of the base's texts with what the crowd says of them, and how good that is."""
     prompts = _some(data.train, config.pairs)
     samples = sample_many(data.base, prompts, _nothing, 2, max_new_tokens=config.max_new_tokens, seed=seed, batch_size=64)
@@ -153,20 +163,19 @@ def _labels(data: Data, config: Config, seed: int) -> tuple[list, dict[str, obje
     return as_comparisons(samples.written, labels), labels.quality._asdict()
 
 
-def _reward(out: Path, data: Data, config: Config, seed: int, tell: Tell) -> RewardModel:
-    folder = out / "reward"
+def _reward(folder: Path, data: Data, config: Config, seed: int, tell: Tell) -> dict[str, object]:
+    """Make the reward model, and say how good it is."""
     if not folder.exists():
         prompts = _some(data.train, 256)
         samples = sample_many(data.base, prompts, _nothing, 2, max_new_tokens=config.max_new_tokens, seed=seed + 1, batch_size=64)
         model = learn_from_ratings(
-            data.base, data.rated, samples.written, epochs=config.reward_epochs, members=config.reward_members, seed=seed,
+            data.base, data.rated, samples.written, width=config.max_new_tokens + 1, epochs=config.reward_epochs,
+            members=config.reward_members, seed=seed,
             log=lambda step, metrics: tell(f"reward model, step {step}: loss {metrics['train/loss'][0]:.3f}") if step % 20 == 0 else None,
         )  # fmt: skip
         save_reward_model(model, folder)
-    model = load_reward_model(folder)
-    if model.held_out is not None:
-        tell(f"reward: {model.held_out.accuracy:.3f} of held-out pairs, calibration error {model.held_out.calibration_error:.3f}")
-    return model
+    held_out = load_reward_model(folder).held_out
+    return {} if held_out is None else held_out._asdict() | {"near_chance": held_out.near_chance}
 
 
 def _best_of_n(data: Data, model: RewardModel, config: Config, seed: int) -> dict[str, object]:
@@ -177,12 +186,13 @@ def _best_of_n(data: Data, model: RewardModel, config: Config, seed: int) -> dic
     return {"points": [each._asdict() for each in curve(samples, (1, 2, 4, 8, 16, 32, 64), gold)]}
 
 
-def _policy(out: Path, data: Data, model: RewardModel, config: Config, name: str, seed: int, tell: Tell) -> dict[str, object]:
+def _policy(
+    out: Path, data: Data, model: RewardModel, judged: Judged, config: Config, name: str, seed: int, tell: Tell
+) -> dict[str, object]:
     """Train by one learner, and compare what came of it with the base."""
     score, _ = rewards_of(model, data.base, PROMPT_LENGTH)
-    told: dict[str, object]
     if name == "dpo":
-        params, told = _by_dpo(data, config, seed), {}
+        params, told = _by_dpo(data, judged()[0], score, config, seed)
     else:
         params, told = _by_rewards(out / name, data, model, config, name, seed, tell)
     found = compare_with_base(
@@ -198,11 +208,9 @@ def _by_rewards(
     run: Path, data: Data, model: RewardModel, config: Config, name: str, seed: int, tell: Tell
 ) -> tuple[Params, dict[str, object]]:
     score, members = rewards_of(model, data.base, PROMPT_LENGTH)
-    base, limits = data.base, Limits(max_kl=20.0)
+    base, limits = data.base, Limits(None, None, None, None) if name == "ppo_without_kl" else Limits(config.max_kl)
     if name.startswith("ppo"):
-        free = name == "ppo_without_kl"
-        limits = Limits(None, None, None, None) if free else limits
-        of_ppo = _ppo_settings(config, free)
+        of_ppo = _ppo_settings(config, free=name in ("ppo_without_kl", "ppo_max_kl"))
         settings: proximal.Config | groups.Config = of_ppo
         learner = proximal.ppo(of_ppo, base.config, base.params)
     else:
@@ -211,7 +219,7 @@ def _by_rewards(
     open_run(run, {"verb": name, "seed": seed, "settings": settings_of(settings)})
 
     def follow(step: int, values: dict[str, float]) -> None:
-        if step % 10 == 0:
+        if step % 5 == 0:
             tell(f"{name}, step {step}: proxy {values['objective/score']:.2f}, gold {values['objective/gold']:.2f}, "
                  f"{values['objective/kl']:.1f} nats")  # fmt: skip
 
@@ -237,8 +245,9 @@ def _ppo_settings(config: Config, free: bool) -> proximal.Config:
         max_prompt_length=PROMPT_LENGTH,
         max_new_tokens=config.max_new_tokens,
         learning_rate=config.learning_rate if free else f"linear({config.learning_rate}, 0)",
-        kl_coefficient=0.0 if free else 0.15,
+        kl_coefficient=0.0 if free else config.kl_coefficient,
         target_kl=None if free else config.target_kl,
+        kl_horizon=config.kl_horizon,
     )
 
 
@@ -253,9 +262,10 @@ def _group_settings(config: Config, baseline: str) -> groups.Config:
         max_prompt_length=PROMPT_LENGTH,
         max_new_tokens=config.max_new_tokens,
         learning_rate=f"linear({config.learning_rate}, 0)",
-        kl_coefficient=0.15,
+        kl_coefficient=config.kl_coefficient,
         kl_in="reward",
         target_kl=config.target_kl,
+        kl_horizon=config.kl_horizon,
     )
 
 
@@ -266,20 +276,30 @@ def _curve(run: Path) -> list[dict[str, float]]:
     return [{"step": float(str(row["steps"]))} | {name: cast(list[float], row[f"objective/{name}"])[0] for name in names} for row in rows]
 
 
-def _by_dpo(data: Data, config: Config, seed: int) -> Params:
-    comparisons, _ = _labels(data, config, seed)
+def _by_dpo(data: Data, comparisons: Sequence[PairOfTexts], score: Score, config: Config, seed: int) -> tuple[Params, dict[str, object]]:
     pairs = comparison_data(comparisons, data.base.tokenizer.pad_id, PROMPT_LENGTH + config.max_new_tokens)
     reference = direct.reference_log_probs(data.base.params, data.base.config, pairs, 64)
     size = min(64, len(comparisons))
     steps = max(1, len(comparisons) // size)
-    settings = direct.Config(total_steps=steps, batch_size=size, learning_rate="linear(1e-4, 0)", beta=0.05)
+    settings = direct.Config(total_steps=steps, batch_size=size, learning_rate=f"linear({config.dpo_learning_rate}, 0)", beta=0.05)
     learner = direct.dpo(settings, data.base.config)
     state: State = learner.init(data.base.params, jax.random.key(seed))
     update, order = jax.jit(learner.update, donate_argnums=0), np.random.default_rng(seed).permutation(len(comparisons))
+    points = []
     for step in range(steps):
         rows = order[step * size : (step + 1) * size]
         state, _ = update(state, (), direct.Batch(pairs.rows(rows), jnp.asarray(reference[rows])))
-    return learner.params(state, data.base.params)
+        if (step + 1) * 4 // steps > step * 4 // steps:
+            points.append(_point(data, learner.params(state, data.base.params), score, config, seed, step + 1))
+    return learner.params(state, data.base.params), {"iterations": steps, "stopped": None, "curve": points}
+
+
+def _point(data: Data, params: Params, score: Score, config: Config, seed: int, step: int) -> dict[str, float]:
+    """Proxy, gold and divergence of texts that the policy writes now."""
+    key = jax.random.fold_in(jax.random.key(seed), step)
+    written, kl, _ = written_by(data.base, params, _some(data.train, 256), key, config.max_new_tokens, 1.0, 128)
+    proxy, gold = (checked_scores(each, written.prompts, written.completions, written.ids) for each in (score, data.gold.score))
+    return {"step": float(step), "score": float(proxy.mean()), "gold": float(gold.mean()), "kl": kl}
 
 
 def _comparison(found: Comparison) -> dict[str, object]:

@@ -11,7 +11,10 @@ from thorndike.plotting.style import COLOURS, STYLE, check_plot_file, save_figur
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_NAMES = {"ppo": "PPO", "grpo": "GRPO", "rloo": "RLOO", "dpo": "DPO", "ppo_without_kl": "PPO without a penalty"}
+_NAMES = {
+    "ppo": "PPO", "grpo": "GRPO", "rloo": "RLOO", "dpo": "DPO", "ppo_without_kl": "PPO without a penalty",
+    "ppo_max_kl": "PPO without a penalty, stopped in time",
+}  # fmt: skip
 _STYLE = """body{font:16px/1.5 system-ui,sans-serif;max-width:60rem;margin:2rem auto;padding:0 1rem;color:#222}
 table{border-collapse:collapse;width:100%;margin:1rem 0}img{max-width:100%}
 td,th{border-bottom:1px solid #ddd;padding:.35rem .6rem;text-align:left;vertical-align:top}

@@ -18,7 +18,7 @@ from thorndike.errors import UserError
 from thorndike.functional.token_sampling import sample_tokens
 from thorndike.language.data import Text, prompt_tokens
 from thorndike.language.decoder import Cache, Params, decode_step, logits, prefill
-from thorndike.language.model import LanguageModel
+from thorndike.language.model import LanguageModel, stop_tokens
 from thorndike.language.model_config import ModelConfig
 from thorndike.settings import AtLeast, Between, check
 
@@ -161,12 +161,6 @@ def generated_texts(model: LanguageModel, generated: Generated) -> list[str]:
     """The text of each row."""
     rows = zip(np.asarray(generated.tokens), np.asarray(generated.lengths), strict=True)
     return [model.tokenizer.decode(row[:length]) for row, length in rows]
-
-
-def stop_tokens(model: LanguageModel) -> tuple[int, ...]:
-    """Where the model's texts end, by its config and its tokenizer."""
-    end = model.tokenizer.eos_id
-    return tuple(dict.fromkeys([*model.config.eos_token_ids, *([] if end is None else [end])]))
 
 
 def left_padded(

@@ -61,10 +61,15 @@ class Config:
     target_kl: Annotated[float | None, MoreThan(0)] = None  # nats a text that beta is steered to; None: beta stays
     kl_horizon: Annotated[float, MoreThan(0)] = 400.0  # episodes over which beta follows
     missing_eos_penalty: Annotated[float | None, AtLeast(0)] = None  # taken off the score of a text that did not end
+    ignore_eos: bool = False  # stop tokens are never chosen: every text goes on to max_new_tokens
     remat: bool = False  # compute activations again in the backward pass: less memory, a third more time
 
     def __post_init__(self) -> None:
         check(self)
+        if self.ignore_eos and self.missing_eos_penalty is not None:
+            raise UserError(
+                "grpo: with ignore_eos no text ends, and missing_eos_penalty would charge all of them: leave one of the two out"
+            )
         if self.episodes % self.group:
             raise UserError(f"grpo: {self.episodes} episodes do not divide into groups of {self.group}")
         if self.episodes % self.batch_size or self.batch_size % self.gradient_accumulation:

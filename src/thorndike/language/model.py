@@ -1,5 +1,6 @@
 """A language model: its config, its parameters and its tokenizer, read from and written to a Hugging Face folder."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,6 +20,20 @@ class LanguageModel(NamedTuple):
     config: ModelConfig
     params: Params
     tokenizer: Tokenizer
+
+
+def stop_tokens(model: LanguageModel) -> tuple[int, ...]:
+    """Where the model's texts end, by its config and its tokenizer."""
+    end = model.tokenizer.eos_id
+    return tuple(dict.fromkeys([*model.config.eos_token_ids, *([] if end is None else [end])]))
+
+
+def never_ending(model: LanguageModel) -> LanguageModel:
+    """The same model, whose texts go on to their limit: stop tokens are never chosen, by the policy, its reference and its learner alike.
+
+    Chosen and passed over they would be a way to write nothing, and the model has never read on after one.
+    """
+    return model._replace(config=replace(model.config, never_chosen=stop_tokens(model)))
 
 
 def load_model(folder: str | Path, *, dtype: Dtype | None = None, adapter: str | Path | None = None) -> LanguageModel:

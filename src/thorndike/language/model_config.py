@@ -74,6 +74,8 @@ class ModelConfig:
     bos_token_id: int | None = None
     eos_token_ids: tuple[int, ...] = ()
     pad_token_id: int | None = None
+    never_chosen: tuple[int, ...] = ()
+    """Tokens of probability 0: what is left is the model's distribution, wherever there is one. Not part of the files."""
     source: str = "{}"
     """The JSON it was read from: written back with what has changed."""
 

@@ -17,8 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float, Key, PyTree
 
 from thorndike.language.decoder import Params
-from thorndike.language.generation import stop_tokens
-from thorndike.language.model import LanguageModel
+from thorndike.language.model import LanguageModel, stop_tokens
 from thorndike.language.over_optimisation import Limits, Signals, mean_disagreement, mean_repetition, trouble, watched
 from thorndike.language.policy_descent import check_ratio
 from thorndike.language.policy_files import Log, Progress, load_progress, save_progress, set_outcome

@@ -63,12 +63,15 @@ class Config:
     target_kl: Annotated[float | None, MoreThan(0)] = 6.0  # nats a text that beta is steered to; None: beta stays
     kl_horizon: Annotated[float, MoreThan(0)] = 400.0  # episodes over which beta follows
     missing_eos_penalty: Annotated[float | None, AtLeast(0)] = None  # taken off the score of a text that did not end
+    ignore_eos: bool = False  # stop tokens are never chosen: every text goes on to max_new_tokens
     whiten_rewards: bool = False  # scale rewards to deviation 1, their mean kept
     value: Annotated[str, OneOf("separate", "shared")] = "separate"  # a model of its own, or a head on the policy
     remat: bool = False  # compute activations again in the backward pass: less memory, a third more time
 
     def __post_init__(self) -> None:
         check(self)
+        if self.ignore_eos and self.missing_eos_penalty is not None:
+            raise UserError("ppo: with ignore_eos no text ends, and missing_eos_penalty would charge all of them: leave one of the two out")
         if self.episodes % self.batch_size or self.batch_size % self.gradient_accumulation:
             raise UserError(
                 f"ppo: {self.episodes} episodes do not divide into minibatches of batch_size {self.batch_size}, or those not into "

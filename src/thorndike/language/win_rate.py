@@ -8,8 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from thorndike.language.decoder import Params
-from thorndike.language.generation import stop_tokens
-from thorndike.language.model import LanguageModel
+from thorndike.language.model import LanguageModel, stop_tokens
 from thorndike.language.over_optimisation import repetition
 from thorndike.language.rewards import Score, checked_scores
 from thorndike.language.rollouts import Prompts, Rollout, Written, as_written, distance, distance_metrics, sample_rollout

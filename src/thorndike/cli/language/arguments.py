@@ -39,6 +39,11 @@ def add_sampling_arguments(parser: Parser, new_tokens: int) -> None:
     parser.add_argument("--max-new-tokens", type=positive_whole, default=new_tokens, metavar="N", help=f"at most (default: {new_tokens})")
 
 
+def add_ignore_eos_argument(parser: Parser) -> None:
+    """Whether texts end."""
+    parser.add_argument("--ignore-eos", action="store_true", help="never choose a stop token: every text goes on to --max-new-tokens")
+
+
 def add_settings_argument(parser: Parser) -> None:
     """``--set NAME=VALUE``."""
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", dest="settings", help="a setting; may be repeated")

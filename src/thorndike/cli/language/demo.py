@@ -17,7 +17,7 @@ from thorndike.cli.parser import Parser, seed_number
 from thorndike.errors import UserError
 from thorndike.suggestions import did_you_mean
 
-LEARNERS = ("ppo", "grpo", "rloo", "dpo", "ppo_without_kl")
+LEARNERS = ("ppo", "grpo", "rloo", "dpo", "ppo_without_kl", "ppo_max_kl")
 EXAMPLES = """\
   thorndike language demo --out runs/demo
   thorndike language demo --out runs/demo --base runs/base/model --learners ppo,grpo,dpo --seed 1

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from thorndike.cli.answer import Answer
 from thorndike.cli.language.aligning import comparison_data, in_words
-from thorndike.cli.language.arguments import add_device_argument, prepare_device
+from thorndike.cli.language.arguments import add_device_argument, add_ignore_eos_argument, prepare_device
 from thorndike.cli.parser import Parser, positive_whole, seed_number
 
 EXAMPLES = """\
@@ -21,6 +21,7 @@ def run(words: Sequence[str]) -> Answer:
     parser.add_argument("--prompts", type=Path, action="append", required=True, metavar="FILE", help="rows with a column prompt")
     parser.add_argument("--reward", action="append", required=True, metavar="WHAT", help="a score; each is reported on its own")
     parser.add_argument("--max-new-tokens", type=positive_whole, default=64, metavar="N", help="at most (default: 64)")
+    add_ignore_eos_argument(parser)
     parser.add_argument("--temperature", type=float, default=1.0, metavar="T", help="of both (default: 1)")
     parser.add_argument("--seed", type=seed_number, default=0, help="the number that all texts follow from (default: 0)")
     add_device_argument(parser)
@@ -31,5 +32,6 @@ def run(words: Sequence[str]) -> Answer:
     found = compare_folders(
         options.base, options.policy, options.prompts, [parse_reward(text) for text in options.reward],
         max_new_tokens=options.max_new_tokens, temperature=options.temperature, seed=options.seed,
+        ignore_eos=options.ignore_eos,
     )  # fmt: skip
     return Answer({"policy": options.policy, "base": options.base, **comparison_data(found)}, in_words(found))
