@@ -22,7 +22,6 @@ from thorndike.games.game import Board, Game, Position
 OLDEST, NEWEST = (2, 6), (2, 6)
 """Of pgx: the first and the last minor version that the tests pass with."""
 FACES = {
-    "othello": ("thorndike.games.placing_boards", "OTHELLO"),
     "hex": ("thorndike.games.placing_boards", "HEX"),
     "go_9x9": ("thorndike.games.placing_boards", "GO_9X9"),
     "go_19x19": ("thorndike.games.placing_boards", "GO_19X19"),
@@ -35,7 +34,6 @@ FACES = {
 }
 """Id -> module and attribute of its face."""
 LONGEST = {
-    "othello": 128,  # 60 squares, and less than one pass for each
     "hex": 122,  # 121 squares, and the swap
     "go_9x9": 162,
     "go_19x19": 722,

@@ -9,6 +9,7 @@ twice). Below a finished position nothing counts (``discount`` 0), and nothing b
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple, TypeAlias
 
 import jax
@@ -18,6 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from thorndike.errors import UserError
 from thorndike.games.game import Game, Position
+from thorndike.games.tree_loop import Simulations
 from thorndike.networks.masking import FORBIDDEN
 
 SEARCHES = ("gumbel", "puct")
@@ -81,11 +83,13 @@ def search(
     logits, value = evaluate(params, positions, key_root)
     legal = jax.vmap(game.legal)(positions)
     root = mctx.RootFnOutput(prior_logits=jnp.where(legal, logits, FORBIDDEN), value=value, embedding=positions)
-    recurrent = _recurrent(game, evaluate)
-    shared = (params, key_search, root, recurrent, settings.simulations, ~legal)
+    recurrent, simulations = _recurrent(game, evaluate), settings.simulations
+    shared = (params, key_search, root, recurrent, simulations, ~legal)
     if settings.kind == "puct":
+        select = partial(mctx.muzero_action_selection, pb_c_init=settings.c_puct, qtransform=_scaled_to_unit)
         output = mctx.muzero_policy(
             *shared,
+            loop_fn=Simulations(params, recurrent, select, select),
             qtransform=_scaled_to_unit,
             dirichlet_fraction=settings.dirichlet_fraction if explore else 0.0,
             dirichlet_alpha=settings.dirichlet_alpha,
@@ -93,10 +97,19 @@ def search(
         )
         action = jnp.argmax(output.action_weights, axis=-1)
     else:
+        considered, completed = min(settings.considered_moves, game.num_actions), _completed(settings)
+
+        def at_root(key: Key[Array, ""], tree: mctx.Tree, node: Int[Array, ""], depth: Int[Array, ""] | int) -> Int[Array, ""]:
+            del depth
+            counts = {"num_simulations": simulations, "max_num_considered_actions": considered}
+            return mctx.gumbel_muzero_root_action_selection(key, tree, node, **counts, qtransform=completed)
+
+        inside = partial(mctx.gumbel_muzero_interior_action_selection, qtransform=completed)
         output = mctx.gumbel_muzero_policy(
             *shared,
-            qtransform=_completed(settings),
-            max_num_considered_actions=min(settings.considered_moves, game.num_actions),
+            loop_fn=Simulations(params, recurrent, at_root, inside),
+            qtransform=completed,
+            max_num_considered_actions=considered,
             gumbel_scale=1.0 if explore else 0.0,
         )
         action = output.action
