@@ -1,6 +1,7 @@
 """The folder that all contestants of ``language_speed.py`` read: a random Llama, a reward model of its shape, prompts, preferences.
 
-A word of the vocabulary is a token, so that both sides make the same tokens of the same files.
+A word of the vocabulary is a token, so that both sides make the same tokens of the same files. Called as
+``language_models.py SIZE FOLDER``, it makes one and prints the number of parameters.
 """
 
 import json
@@ -21,10 +22,8 @@ from thorndike.language.tokenizer import Tokenizer, new_tokenizer
 
 sys.path.insert(0, str(Path(__file__).parent / "peers"))
 
-from language_task import BOS, EOS, NEW, PAD, PROMPT
+from language_task import BOS, EOS, NEW, PAD, PROMPT, SIZES
 
-SIZES = {"1.07 M": (2048, 128, 4, 4, 352), "7.5 M": (4096, 256, 8, 8, 688)}
-"""Vocabulary, width, layers, heads, inner width."""
 ROWS = 1024
 
 
@@ -67,3 +66,7 @@ def make_folder(size: str, folder: Path) -> int:
     (folder / "preferences.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     (folder / "prompts.jsonl").write_text("".join(json.dumps({"prompt": row["prompt"]}) + "\n" for row in rows))
     return sum(leaf.size for leaf in jax.tree.leaves(params))
+
+
+if __name__ == "__main__":
+    print(make_folder(sys.argv[1], Path(sys.argv[2])))

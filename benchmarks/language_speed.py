@@ -15,7 +15,10 @@ import sys
 import tempfile
 from pathlib import Path
 
-from language_models import SIZES, make_folder
+sys.path.insert(0, str(Path(__file__).parent / "peers"))
+
+from language_task import BATCH, NEW, PROMPT, SIZES
+
 from machine import commit, processor, versions
 from processes import last_json, run_pinned
 
@@ -25,7 +28,7 @@ RESULTS = HERE / "results" / "language" / "speed.json"
 TASKS = {"generate": 5, "dpo": 4, "grpo": 4, "ppo": 2}
 """Steps of a window; ``generate``: calls."""
 PPO_BY = "trl-1.12.0"
-GENERATION = ["--batch", "128", "--prompt", "8", "--new", "24", "--rounds"]
+GENERATION = ["--batch", str(BATCH), "--prompt", str(PROMPT), "--new", str(NEW), "--rounds"]
 Line = dict[str, float]
 
 
@@ -51,6 +54,16 @@ def measured(command: list[str], path: list[Path], core: int, cache: Path) -> Li
     if done.exit_code or line is None:
         raise SystemExit(f"{' '.join(command)}\n{done.stderr[-2000:]}")
     return {name: value for name, value in line.items() if isinstance(value, int | float)}
+
+
+def parameters_of(size: str, folder: Path, core: int, cache: Path) -> int:
+    """Make a size's folder, in a process of its own: a child's peak memory begins at its parent's size, which must stay small."""
+    folder.mkdir()
+    variables = {"PYTHONPATH": str(ROOT / "src"), "THORNDIKE_CACHE": str(cache)}
+    made = run_pinned([sys.executable, str(HERE / "language_models.py"), size, str(folder)], variables, core, 600)
+    if made.exit_code:
+        raise SystemExit(made.stderr[-2000:])
+    return int(made.stdout.split()[-1])
 
 
 def summary(rounds: list[dict[str, Line]]) -> dict[str, object]:
@@ -88,8 +101,8 @@ def main() -> None:
     python, old = options.peers / "bin" / "python", options.peers / PPO_BY
     found: dict[str, dict[str, list[dict[str, Line]]]] = {}
     with tempfile.TemporaryDirectory() as scratch:
-        parameters = {size: make_folder(size, Path(scratch) / size) for size in options.sizes.split(",")}
         cache = Path(scratch) / "cache"
+        parameters = {size: parameters_of(size, Path(scratch) / size, options.core, cache) for size in options.sizes.split(",")}
         for number in range(options.repeats):
             for size in parameters:
                 for task in options.only.split(","):

@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 
+SIZES = {"1.07 M": (2048, 128, 4, 4, 352), "7.5 M": (4096, 256, 8, 8, 688)}
+"""Vocabulary, width, layers, heads, inner width."""
 BATCH, PROMPT, NEW = 128, 8, 24
 """Texts of a batch, tokens of a prompt, new tokens of a text."""
 PAIRS, BETA = 64, 0.1
