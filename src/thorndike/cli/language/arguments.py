@@ -9,7 +9,7 @@ from thorndike.cli.parser import Parser, at_least_zero, positive_whole
 from thorndike.config_fields import fields_in_source
 from thorndike.errors import UserError
 from thorndike.settings import FieldFacts, describe_kind, parse_settings
-from thorndike.startup import choose_device
+from thorndike.startup import choose_device, prepare_large_steps
 
 Config = TypeVar("Config")
 DEVICES = ("auto", "cpu", "gpu")
@@ -78,6 +78,7 @@ def prepare_device(device: str, model: Path | None) -> None:
         if not (model / "config.json").is_file():
             raise UserError(f"{model} is no model: it has no config.json; give a folder as transformers' save_pretrained writes it")
         large = sum(path.stat().st_size for path in model.glob("*.safetensors")) > _LARGE
+    prepare_large_steps()
     choose_device(device, large)
 
 
