@@ -21,7 +21,9 @@ class Entry(NamedTuple):
     learns_from: tuple[str, ...] = ("environment",)
     """``environment``, ``dataset``, or both."""
     plays: bool = False
-    """Whether it learns games of two by playing itself, and nothing else."""
+    """Whether it learns games of two by playing itself."""
+    only_plays: bool = False
+    """Whether it learns nothing else."""
 
 
 ALGORITHMS: dict[str, Entry] = {
@@ -132,6 +134,14 @@ ALGORITHMS: dict[str, Entry] = {
         num_envs=256,
         network=False,
         plays=True,
+        only_plays=True,
+    ),
+    "muzero": Entry(
+        "thorndike.algorithms.muzero",
+        "MuZero: a tree search through a learnt model; games and Discrete actions",
+        ("Discrete",),
+        network=False,
+        plays=True,
     ),
     "planning": Entry(
         "thorndike.algorithms.planning",
@@ -147,7 +157,7 @@ ALGORITHMS: dict[str, Entry] = {
 def check_plays(algorithm: str, environment: str, of_two: bool) -> None:
     """Raises UserError if an algorithm for games is to learn something else, or another one a game ``of_two``, whose rewards take turns."""
     players = [name for name, entry in ALGORITHMS.items() if entry.plays]
-    if ALGORITHMS[algorithm].plays and not of_two:
+    if ALGORITHMS[algorithm].only_plays and not of_two:
         raise UserError(f"{algorithm} learns games of two players, such as connect_four, and {environment} is none: train it with ppo")
     if of_two and not ALGORITHMS[algorithm].plays:
         raise UserError(

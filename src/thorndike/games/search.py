@@ -45,7 +45,7 @@ class SearchSettings(NamedTuple):
     value_scale: float = 0.5
     """Of ``gumbel``: c_scale, the weight of values against the prior; 0.5 is the paper's 1 for values in [0, 1]."""
     rescale_values: bool = False
-    """Of ``gumbel``: stretch the values of a node's moves to [0, 1] first."""
+    """Stretch the values of a node's moves to [0, 1] first: where nobody knows how large values are."""
 
 
 class Found(NamedTuple):
@@ -81,12 +81,24 @@ def search(
     logits, value = evaluate(params, positions, key_root)
     legal = jax.vmap(game.legal)(positions)
     root = mctx.RootFnOutput(prior_logits=jnp.where(legal, logits, FORBIDDEN), value=value, embedding=positions)
-    recurrent = _recurrent(game, evaluate)
-    shared = (params, key_search, root, recurrent, settings.simulations, ~legal)
+    return grow(settings, params, root, _recurrent(game, evaluate), legal, key_search, explore)
+
+
+def grow(
+    settings: SearchSettings,
+    params: PyTree,
+    root: mctx.RootFnOutput,
+    recurrent: mctx.RecurrentFn,
+    legal: Bool[Array, "B actions"],
+    key: Key[Array, ""],
+    explore: bool,
+) -> Found:
+    """Search from ``root``, whatever it is that ``recurrent`` follows: rules, or what a network thinks of them. Consumes the key."""
+    shared = (params, key, root, recurrent, settings.simulations, ~legal)
     if settings.kind == "puct":
         output = mctx.muzero_policy(
             *shared,
-            qtransform=_scaled_to_unit,
+            qtransform=mctx.qtransform_by_parent_and_siblings if settings.rescale_values else _scaled_to_unit,
             dirichlet_fraction=settings.dirichlet_fraction if explore else 0.0,
             dirichlet_alpha=settings.dirichlet_alpha,
             pb_c_init=settings.c_puct,
@@ -96,7 +108,7 @@ def search(
         output = mctx.gumbel_muzero_policy(
             *shared,
             qtransform=_completed(settings),
-            max_num_considered_actions=min(settings.considered_moves, game.num_actions),
+            max_num_considered_actions=min(settings.considered_moves, legal.shape[1]),
             gumbel_scale=1.0 if explore else 0.0,
         )
         action = output.action
