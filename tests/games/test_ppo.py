@@ -95,7 +95,7 @@ def test_a_wrapper_that_hides_the_position_is_refused_in_one_line():
 
 
 def test_other_learners_are_refused_and_told_who_plays():
-    with pytest.raises(UserError, match="train ppo or alphazero on it"):
+    with pytest.raises(UserError, match="train ppo or alphazero or muzero on it"):
         td.train("a2c", "tic_tac_toe", steps=1000)
 
 

@@ -24,6 +24,8 @@ class Entry(NamedTuple):
     """Whether it learns games of two by playing itself."""
     only_games: bool = False
     """Whether it learns nothing else."""
+    searches: bool = False
+    """Whether it acts by a search, which needs a game's rules."""
 
 
 ALGORITHMS: dict[str, Entry] = {
@@ -139,6 +141,15 @@ ALGORITHMS: dict[str, Entry] = {
         network=False,
         plays=True,
         only_games=True,
+        searches=True,
+    ),
+    "muzero": Entry(
+        "thorndike.algorithms.muzero",
+        "MuZero: a tree search through a learnt model; games and Discrete actions",
+        ("Discrete",),
+        network=False,
+        plays=True,
+        searches=True,
     ),
     "planning": Entry(
         "thorndike.algorithms.planning",

@@ -35,6 +35,11 @@ def observation_space(game: Game) -> gymnasium.spaces.Dict:
     )
 
 
+def observes_game(space: gymnasium.Space) -> bool:
+    """Whether observations of this space are positions of a game."""
+    return isinstance(space, spaces.Dict) and set(space.spaces) == {BOARD, MASK, POSITION}
+
+
 def observed_position(game: Game, position: Position) -> Observation:
     """One position as an observation."""
     return {
