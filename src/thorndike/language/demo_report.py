@@ -63,7 +63,7 @@ def page(found: Found, picture: bytes) -> str:
     raters = ", ".join(f"{html.escape(name)} {value:.2f}" for name, value in sorted(reliability.items(), key=lambda each: -each[1]))
     return f"""<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">
 <title>RLHF demo</title><style>{_STYLE}</style><h1>Film reviews that go on kindly</h1>
-<p>A small model of film reviews, a reward model of real people's ratings of film snippets, and policies that were trained on it.
+<p>A small model of film reviews, a reward model of real people's ratings of snippets, and policies that were trained on it.
 <em>Gold</em> is what is wanted (kind words, no repetition), which no policy was shown; <em>proxy</em> is what the reward model says.
 Seed {found["seed"]}.</p>
 <img alt="Left: gold by distance from the base. Right: proxy and gold while policies learn." src="data:image/png;base64,{image}">
