@@ -99,7 +99,7 @@ def collect_clips(
     if learnt is not None:
         stored = read_reward(learnt)
         sums = predicted_returns(stored.held, found, stored.net_arch)
-    chosen = pairs_to_ask(len(found), pairs, dice, sums)
+    chosen = pairs_to_ask(found.number, pairs, dice, sums)
     used, renumbered = np.unique(chosen, return_inverse=True)
     made_by = "random actions" if loaded is None else str(loaded.run)
     kept = [(int(first), int(second)) for first, second in renumbered.reshape(-1, 2)]

@@ -22,7 +22,7 @@ EXACT = 1e-6
 def ask(where: Path, collection: Collection) -> int:
     """Put a collection's pairs before the raters; how many were not there yet."""
     question, made_by = read_about(where).question, collection.made_by
-    shown = [_content(collection, place) for place in range(len(collection.segments))]
+    shown = [_content(collection, place) for place in range(collection.segments.number)]
     items = [NewItem({"text": question}, [Candidate(shown[each], made_by) for each in pair]) for pair in collection.pairs]
     with Store(where / STORE) as store:
         return store.add_items(store.project(PROJECT), items)
@@ -30,7 +30,7 @@ def ask(where: Path, collection: Collection) -> int:
 
 def read_choices(where: Path) -> Choices:
     """All pairs that somebody has judged, each once: where raters disagree, by what Dawid and Skene's model makes of them."""
-    sizes = [len(each.segments) for each in collections(where)]
+    sizes = [each.segments.number for each in collections(where)]
     starts = np.cumsum([0, *sizes])
     with Store(where / STORE) as store:
         project = store.project(PROJECT)

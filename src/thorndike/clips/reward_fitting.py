@@ -114,20 +114,26 @@ def fit_reward(
     segments: Segments, choices: Choices, spaces: tuple[gymnasium.Space, gymnasium.Space], config: Config, seed: int = 0
 ) -> tuple[LearnedReward, Report]:
     """The reward that these choices between these clips tell. Raises ``UserError`` for too few of them."""
-    if len(choices) < _FEWEST:
-        raise UserError(f"{len(choices)} choices are too few to learn a reward from: judge at least {_FEWEST} pairs of clips")
+    if choices.number < _FEWEST:
+        raise UserError(f"{choices.number} choices are too few to learn a reward from: judge at least {_FEWEST} pairs of clips")
     blank = _normalised_inputs(segments, no_reward(spaces, config.members, config.net_arch))
     data = _data(blank, segments, choices)
-    network, obs, action = network_of(blank.observations, blank.actions, config.net_arch)
-    key_members, key_fit = jax.random.split(jax.random.key(seed))
-    begun = initial_members(network, obs, action, config.members, key_members)
-    # One member after the other in one program: on a CPU products with an axis of members in front are slower.
-    fit = jax.jit(lambda begun, keys, data: jax.lax.map(lambda each: _fit_member(network, config, each[0], data, each[1]), (begun, keys)))
-    found: _Fitted = fit(begun, jax.random.split(key_fit, config.members), data)
+    found = _fit_members(config, blank, data, jax.random.key(seed))
     if not bool(jnp.all(jnp.isfinite(found.params))):
         raise UserError(f"the reward's numbers are no longer finite: lower learning_rate, which is {config.learning_rate:g}")
     learnt = _levelled(blank._replace(params=found.params), segments, config)
     return learnt, _report(found, predicted_returns(learnt, segments, config.net_arch), choices)
+
+
+@partial(jax.jit, static_argnames="config")
+def _fit_members(config: Config, blank: LearnedReward, data: _Data, key: Key[Array, ""]) -> _Fitted:
+    """All members, one after the other in one program: on a CPU products with an axis of members in front are slower."""
+    network, obs, action = network_of(blank.observations, blank.actions, config.net_arch)
+    key_members, key_fit = jax.random.split(key)
+    begun = initial_members(network, obs, action, config.members, key_members)
+    keys = jax.random.split(key_fit, config.members)
+    found: _Fitted = jax.lax.map(lambda each: _fit_member(network, config, each[0], data, each[1]), (begun, keys))
+    return found
 
 
 def predicted_returns(held: LearnedReward, segments: Segments, hidden: tuple[int, ...]) -> Float[np.ndarray, "E C"]:
@@ -138,8 +144,11 @@ def predicted_returns(held: LearnedReward, segments: Segments, hidden: tuple[int
 
 def _raw_of_steps(held: LearnedReward, segments: Segments, hidden: tuple[int, ...]) -> Float[np.ndarray, "E C L"]:
     leaves, action = tuple(_steps(leaf) for leaf in segments.obs), _steps(segments.action)
-    raw = jax.jit(lambda held, leaves, action: raw_rewards(held, leaves, action, hidden))(held, leaves, action)
+    raw = _compiled_rewards(held, leaves, action, tuple(hidden))
     return np.asarray(raw).reshape(len(raw), *segments.valid.shape)
+
+
+_compiled_rewards = partial(jax.jit, static_argnames="hidden")(raw_rewards)
 
 
 def _normalised_inputs(segments: Segments, blank: LearnedReward) -> LearnedReward:
@@ -225,7 +234,7 @@ def _report(found: _Fitted, sums: Float[np.ndarray, "E C"], choices: Choices) ->
     right = ((margin > 0) == (choices.p_first > 0.5))[judged]
     number = len(right)
     return Report(
-        choices=len(choices),
+        choices=choices.number,
         held_out=number,
         accuracy=float(right.mean()) if number else 0.5,
         accuracy_ci95=wilson_interval(int(right.sum()), number) if number else (0.0, 1.0),

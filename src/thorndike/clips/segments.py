@@ -19,7 +19,9 @@ class Segments(NamedTuple):
     """The environment's own: nothing is learnt from it, it is for simulated raters."""
     valid: Bool[np.ndarray, "N L"]
 
-    def __len__(self) -> int:
+    @property
+    def number(self) -> int:
+        """N."""
         return len(self.valid)
 
     @property
@@ -45,7 +47,9 @@ class Choices(NamedTuple):
     p_first: Float[np.ndarray, " N"]
     """How likely the first is the better one: 0.5 for a tie."""
 
-    def __len__(self) -> int:
+    @property
+    def number(self) -> int:
+        """N."""
         return len(self.first)
 
 
