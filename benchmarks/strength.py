@@ -1,8 +1,8 @@
 """Strength by CPU-seconds of training, beside a plain loop of pgx's Connect Four and mctx as pgx's example of AlphaZero puts them together.
 
-python benchmarks/strength.py ours --budget 240     train the preset that long, into benchmarks/results/strength.json
-python benchmarks/strength.py plain --budget 900    the plain loop: 6 residual blocks of 64 channels, 32 simulations, one pass over each batch
-python benchmarks/strength.py --figure              both curves, docs/images/strength.png, and how many times the CPU-seconds the plain loop takes
+python benchmarks/strength.py ours --budget 130     train the preset that long, into benchmarks/results/strength.json
+python benchmarks/strength.py plain --budget 900    the plain loop: 6 residual blocks of 64 channels, 32 simulations, one pass a batch
+python benchmarks/strength.py --figure              both curves, docs/images/strength.png, and CPU-seconds to equal strength
 
 Both are stopped at the same kind of points and judged alike: every second of the positions of benchmarks/data/connect_four.txt (600), 32
 simulations a move, per cent of moves after which the game is worth less than after the best one. CPU-seconds are those of playing and
@@ -23,9 +23,10 @@ import mctx
 import numpy as np
 import optax
 import pgx
-from connect_four import labelled, positions_of
 
+from connect_four import labelled, positions_of
 from thorndike.algorithms.alphazero import Config, alphazero
+from thorndike.environments.wrappers import chain
 from thorndike.games.connect_four import CONNECT_FOUR
 from thorndike.games.environment import game_environment, observed_position
 from thorndike.games.settings import game_settings
@@ -34,7 +35,6 @@ from thorndike.plotting.style import COLOURS, STYLE, save_figure
 from thorndike.training.presets import find_preset
 from thorndike.training.runner import runner
 from thorndike.training.sources import compiled_source
-from thorndike.environments.wrappers import chain
 
 ROOT = Path(__file__).parents[1]
 RESULT, FIGURE = ROOT / "benchmarks" / "results" / "strength.json", ROOT / "docs" / "images" / "strength.png"

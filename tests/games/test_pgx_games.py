@@ -1,4 +1,4 @@
-"""Games of pgx, and Othello: rules against slow Python and python-chess, who moves first, names there and back, clicks, symmetries, versions."""
+"""Games of pgx, and Othello: rules against slow Python and python-chess, who moves first, names, clicks, symmetries, versions."""
 
 import jax
 import jax.numpy as jnp
