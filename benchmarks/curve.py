@@ -3,7 +3,7 @@
 python benchmarks/curve.py go_9x9 --budget 240    into benchmarks/results/curve.json and docs/images/curve_go_9x9.png
 python benchmarks/curve.py chess --budget 240
 
-CPU-seconds are those of playing and learning on one core, compiling left out. Each checkpoint plays every other player, from random openings
+CPU-seconds are those of playing and learning on one core, compiling left out. Everybody plays everybody, from random openings
 that are played twice with colours swapped; ratings are fitted to all games at once, and the random player's is set to 0.
 """
 
