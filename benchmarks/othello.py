@@ -13,7 +13,6 @@ from pathlib import Path
 
 from connect_four import Match
 from side_by_side import engine_side, play, run_side
-
 from thorndike.games.othello import OTHELLO
 
 RESULT = Path(__file__).parents[1] / "benchmarks" / "results" / "othello.json"

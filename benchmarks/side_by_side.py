@@ -11,7 +11,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PyTree
 
 import thorndike as td
 from thorndike.api.building import build_algorithm
@@ -44,7 +43,7 @@ def run_side(name: str, game: Game, run: Path, simulations: int) -> Side:
     noise = policy.noise(jax.random.key(0), TOGETHER)
     observed = jax.vmap(lambda position: observed_position(game, position))
     decide = jax.jit(lambda actor, positions: algorithm.greedy(actor, algorithm.memory(TOGETHER), observed(positions), noise)[1])
-    return Side(name, _together(lambda positions, number: decide(actor, positions)))
+    return Side(name, together(lambda positions, number: decide(actor, positions)))
 
 
 def mcts_side(game: Game, simulations: int) -> Side:
@@ -59,7 +58,7 @@ def mcts_side(game: Game, simulations: int) -> Side:
         return search(game, evaluate, settings, (), positions, key, explore=False).action
 
     name = f"mcts:simulations={simulations}" if simulations else "random"
-    return Side(name, _together(lambda positions, number: decide(positions, jax.random.fold_in(base, number))))
+    return Side(name, together(lambda positions, number: decide(positions, jax.random.fold_in(base, number))))
 
 
 def engine_side(text: str, game: Game) -> Side:
@@ -68,7 +67,8 @@ def engine_side(text: str, game: Game) -> Side:
     return Side(text, lambda turns: [player.choose(turn).action for turn in turns], player.close)
 
 
-def _together(decide: Callable[[Position, int], jax.Array]) -> Answer:
+def together(decide: Callable[[Position, int], jax.Array]) -> Answer:
+    """Positions are searched ``TOGETHER`` at a time, the last ones beside copies of the first."""
     asked = 0
 
     def answer(turns: Sequence[Turn]) -> list[int]:
@@ -98,7 +98,12 @@ def play(game: Game, first: Side, second: Side, games: int, plies: int, seed: in
     begun = openings(rules, plies, seed)
     facts = jax.jit(jax.vmap(lambda p: (game.terminated(p), game.player(p), game.rewards(p)[0])))
     legal = jax.jit(jax.vmap(game.legal))
-    step = jax.jit(jax.vmap(lambda p, a: game.step(p, a, key)))
+
+    @jax.jit
+    @jax.vmap
+    def step(position: Position, action: jax.Array, over: jax.Array) -> Position:
+        return jax.tree.map(lambda new, old: jnp.where(over, old, new), game.step(position, action, key), position)
+
     positions = jax.tree.map(lambda x: np.repeat(np.asarray(x)[None], games, axis=0), rules.init(seed))
     moves: list[list[int]] = [[] for _ in range(games)]
     spent, asked = [0.0, 0.0], [0, 0]
@@ -125,7 +130,6 @@ def play(game: Game, first: Side, second: Side, games: int, plies: int, seed: in
             if not allowed[i, actions[i]]:
                 raise ValueError(f"action {actions[i]} is not legal after {moves[i]}")
             moves[i].append(int(actions[i]))
-        after = jax.tree.map(np.asarray, step(positions, actions))
-        positions = jax.tree.map(lambda new, old: np.where(over.reshape((games,) + (1,) * (new.ndim - 1)), old, new), after, positions)
+        positions = jax.tree.map(np.asarray, step(positions, actions, over))
     scores = [(1.0 + (float(reward[i]) if i % 2 == 0 else -float(reward[i]))) / 2 for i in range(games)]
     return Played(scores, (spent[0] / max(asked[0], 1), spent[1] / max(asked[1], 1)))

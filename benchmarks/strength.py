@@ -1,8 +1,8 @@
 """Strength by CPU-seconds of training, beside a plain loop of pgx's Connect Four and mctx as pgx's example of AlphaZero puts them together.
 
-python benchmarks/strength.py ours --budget 240     train the preset that long, into benchmarks/results/strength.json
-python benchmarks/strength.py plain --budget 900    the plain loop: 6 residual blocks of 64 channels, 32 simulations, one pass over each batch
-python benchmarks/strength.py --figure              both curves, docs/images/strength.png, and how many times the CPU-seconds the plain loop takes
+python benchmarks/strength.py ours --budget 130     train the preset that long, into benchmarks/results/strength.json
+python benchmarks/strength.py plain --budget 900    the plain loop: 6 residual blocks of 64 channels, 32 simulations, one pass a batch
+python benchmarks/strength.py --figure              both curves, docs/images/strength.png, and CPU-seconds to equal strength
 
 Both are stopped at the same kind of points and judged alike: every second of the positions of benchmarks/data/connect_four.txt (600), 32
 simulations a move, per cent of moves after which the game is worth less than after the best one. CPU-seconds are those of playing and
@@ -11,7 +11,6 @@ learning on one core; compiling and judging are left out. A run that is interrup
 
 import argparse
 import json
-import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -23,9 +22,10 @@ import mctx
 import numpy as np
 import optax
 import pgx
-from connect_four import labelled, positions_of
 
+from connect_four import labelled, positions_of
 from thorndike.algorithms.alphazero import Config, alphazero
+from thorndike.environments.wrappers import chain
 from thorndike.games.connect_four import CONNECT_FOUR
 from thorndike.games.environment import game_environment, observed_position
 from thorndike.games.settings import game_settings
@@ -34,7 +34,6 @@ from thorndike.plotting.style import COLOURS, STYLE, save_figure
 from thorndike.training.presets import find_preset
 from thorndike.training.runner import runner
 from thorndike.training.sources import compiled_source
-from thorndike.environments.wrappers import chain
 
 ROOT = Path(__file__).parents[1]
 RESULT, FIGURE = ROOT / "benchmarks" / "results" / "strength.json", ROOT / "docs" / "images" / "strength.png"
@@ -229,7 +228,7 @@ def measure(name: str, budget: float, seed: int, first: float) -> None:
     points, spent, due = [], 0.0, first
     results = json.loads(RESULT.read_text(encoding="utf-8")) if RESULT.exists() else {}
     positions, choose = next(learner)
-    # The first round compiles; what it learns counts, at the rate of the rounds after it.
+    # The first round compiles; its seconds are those of its positions at the rate of the rounds after it.
     points.append({"cpu_s": 0.0, "positions": positions, "errors": judge(choose)})
     rounds = 1
     while spent < budget:
@@ -240,6 +239,7 @@ def measure(name: str, budget: float, seed: int, first: float) -> None:
         if spent >= due or spent >= budget:
             due *= 1.5
             seconds = spent * rounds / (rounds - 1)
+            points[0]["cpu_s"] = round(spent / (rounds - 1), 1)
             points.append({"cpu_s": round(seconds, 1), "positions": positions, "errors": judge(choose)})
             print(name, points[-1], flush=True)
             results = json.loads(RESULT.read_text(encoding="utf-8")) if RESULT.exists() else {}
@@ -248,38 +248,31 @@ def measure(name: str, budget: float, seed: int, first: float) -> None:
 
 
 def seconds_to(points: Sequence[dict], error: float) -> float | None:
-    """CPU-seconds at which a curve first comes down to that error for good, between its points by the logarithm; None: it does not."""
-    for i in range(1, len(points)):
-        before, after = points[i - 1], points[i]
-        if after["errors"]["all"] <= error:
-            if before["cpu_s"] == 0:
-                return after["cpu_s"]
-            share = (before["errors"]["all"] - error) / (before["errors"]["all"] - after["errors"]["all"])
-            return math.exp(math.log(before["cpu_s"]) + share * (math.log(after["cpu_s"]) - math.log(before["cpu_s"])))
-    return None
+    """CPU-seconds to the first point with no more errors than that; None: there is none."""
+    return next((point["cpu_s"] for point in points if point["errors"]["all"] <= error), None)
 
 
 def compare() -> None:
-    """The ratio at the best that the plain loop came to, and on the way there; the figure."""
+    """How many times the CPU-seconds the plain loop takes to what ours has come to at each point, or more than that; the figure."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
     results = json.loads(RESULT.read_text(encoding="utf-8"))
-    reached = sorted({point["errors"]["all"] for point in results["plain"]["points"][1:]})
-    rows = []
-    for error in reached:
-        theirs, own = (seconds_to(results[name]["points"], error) for name in ("plain", "ours"))
-        if theirs is not None and own is not None:
-            rows.append({"errors": error, "plain_cpu_s": round(theirs, 1), "ours_cpu_s": round(own, 1), "ratio": round(theirs / own, 1)})
+    theirs, rows = results["plain"]["points"], []
+    for point in results["ours"]["points"]:
+        own, error = point["cpu_s"], point["errors"]["all"]
+        reached = seconds_to(theirs, error)
+        ratio = (reached or theirs[-1]["cpu_s"]) / own
+        rows.append({"errors": error, "ours_cpu_s": own, "plain_cpu_s": reached, "ratio": round(ratio, 1), "at_least": reached is None})
     results["equal_strength"] = rows
     RESULT.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
     print(json.dumps(rows))
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(figsize=(7, 4))
         for colour, name in zip(COLOURS, LABELS, strict=False):
-            points = results[name]["points"][1:]
+            points = results[name]["points"]
             axes.plot([p["cpu_s"] for p in points], [p["errors"]["all"] for p in points], "o-", color=colour, label=LABELS[name])
         axes.set(xscale="log", ylim=(0, None), xlabel="CPU-seconds of training, one core", ylabel=f"errors, {SIMULATIONS} simulations (%)")
         axes.set_title("Connect Four: moves that give something away, by a perfect solver", fontsize=10)

@@ -40,6 +40,14 @@ def test_its_strength_stands_in_its_name_so_that_kept_games_of_another_are_not_t
     assert td.player("trained", "tic_tac_toe", simulations=8).name == "trained:simulations=8"
 
 
+def test_a_player_is_told_by_its_parameters_from_one_that_was_trained_on():
+    policy = td.load(trained_run("tic_tac_toe"))
+    identity = td.player(policy, "tic_tac_toe").identity
+    assert identity == td.player("trained", "tic_tac_toe").identity != ""
+    policy.policy.actors = jax.tree.map(lambda leaf: leaf + np.float32(1e-6), policy.policy.actors)
+    assert td.player(policy, "tic_tac_toe").identity != identity
+
+
 @pytest.mark.parametrize("name", ["", "no_such_game", "../tic_tac_toe", "tic_tac_toe/policy"])
 def test_there_is_none_of_other_names(name):
     assert trained_run(name) is None

@@ -1,9 +1,11 @@
 """A trained policy as a player: searches with its network from the position, or plays the network's best move where it cannot search."""
 
+import hashlib
 from collections.abc import Callable, Mapping
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Key, PyTree
 
 from thorndike.errors import UserError
@@ -56,7 +58,15 @@ def agent_player(
         of_two = game.num_players == 2 and not game.has_chance
         return Choice(int(action[0]), min(max(float(value[0] + 1) / 2, 0.0), 1.0) if of_two else None)
 
-    return Player(name, choose)
+    return Player(name, choose, identity=fingerprint((actor, statistics)))
+
+
+def fingerprint(tree: PyTree) -> str:
+    """A short text that another tree has another of."""
+    digest = hashlib.sha256()
+    for leaf in jax.tree.leaves(tree):
+        digest.update(np.asarray(leaf).tobytes())
+    return digest.hexdigest()[:16]
 
 
 def _evaluation(game: Game, algorithm: Algorithm, probabilities: Callable, wrapper: Wrapper, statistics: PyTree) -> Evaluate:

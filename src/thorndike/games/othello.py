@@ -94,7 +94,7 @@ def _sides(position: OthelloPosition) -> tuple[Words, Words]:
 
 def _lines(begin: Words, theirs: Words) -> Lines:
     """In each direction the other's stones that lie one behind another next to ``begin``."""
-    among = theirs[:, None] & _EDGES
+    among = theirs[:, None] & _EDGES[None]
     found = _shifted(jnp.broadcast_to(begin[:, None], (2, 8))) & among
     for _ in range(_LONGEST - 1):
         found |= _shifted(found) & among
@@ -112,7 +112,7 @@ def _any(lines: Lines) -> Words:
 
 
 def _bits(words: Words) -> UInt32[Array, " 64"]:
-    return (words[:, None] >> _BIT & jnp.uint32(1)).reshape(_SQUARES)
+    return (words[:, None] >> _BIT[None] & jnp.uint32(1)).reshape(_SQUARES)
 
 
 def _board(position: OthelloPosition) -> Board:

@@ -1,8 +1,8 @@
-"""The simulations of mctx's search, one after another, for all trees of a batch at once: the same trees bit for bit, in a fraction of the time.
+"""The simulations of mctx's search for all trees of a batch at once: the same trees bit for bit, in less time.
 
-mctx maps a program for one tree over the batch, and a loop of a mapped program chooses between old and new for everything that it carries:
-each step back to the root copies the statistics of all moves of all nodes. Here each step writes one number a tree. Both of mctx's policies
-take a loop to run their simulations in (``loop_fn``); this one is put there, and the step that mctx hands over is left unused.
+mctx maps a program for one tree over the batch, and a loop of a mapped program chooses between old and new for everything that it
+carries: each step back to the root copies the statistics of all moves of all nodes. Here each step writes one number a tree. Both of
+mctx's policies take a loop to run their simulations in (``loop_fn``); this one is put there, and the step that mctx hands over is not used.
 
 The root's move is chosen outside the loop that walks down, so that the choice at the root is not made once more at every level.
 """
