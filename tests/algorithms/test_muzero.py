@@ -107,7 +107,7 @@ def test_what_it_cannot_learn_is_refused():
     with pytest.raises(UserError, match="two players without dice"):
         muzero(Config(), spec._replace(game=TIC_TAC_TOE._replace(has_chance=True)))
     with pytest.raises(UserError, match="buffer_size 10 holds fewer than the"):
-        build_algorithm("muzero", {"buffer_size": 10}, spec, None)
+        build_algorithm("muzero", {"buffer_size": 10, "train_freq": 2}, spec, None)
 
 
 @pytest.mark.parametrize(("environment", "engine"), [("tic_tac_toe", "auto"), ("CartPole-v1", "gymnasium")])

@@ -66,7 +66,9 @@ def test_a_perfect_model_is_searched_as_the_rules_are(kind):
     batch = lines.batch(pieces)
     by_rules = search(TIC_TAC_TOE, evaluate_made_up, settings, (), batch, KEY, explore=False)
     obs = jnp.concatenate([batch.pieces.astype(jnp.float32), jnp.zeros((len(pieces), 2))], axis=1)
-    view = View(9, spaces.Box(0, np.inf, (4,)), lambda obs: obs, lambda seen: jax.vmap(TIC_TAC_TOE.legal)(positions_of(seen)))
+    view = View(
+        9, spaces.Box(0, np.inf, (4,)), lambda obs: obs, lambda seen: jax.vmap(TIC_TAC_TOE.legal)(positions_of(seen)), lambda batch: batch
+    )
     imagined = imagine(Imagination(perfect_model(), SCALE, -1.0, view), settings, (), obs, jax.random.split(KEY)[1], False)
     np.testing.assert_array_equal(imagined.visits, by_rules.visits)
     np.testing.assert_allclose(imagined.policy, by_rules.policy, atol=1e-2)
@@ -78,7 +80,7 @@ def test_no_forbidden_action_is_found_and_values_of_any_size_are_searched(kind):
     model = learned_model(spaces.Box(-1.0, 1.0, (3,)), 4, 11, ModelShape((8,), "nature", 6, 8))
     obs, legal = jnp.linspace(-1, 1, 15).reshape(5, 3), np.array([[True, False, True, False]] * 4 + [[False, True, False, False]])
     params = model.network.init(KEY, obs)
-    view = View(4, spaces.Box(-1.0, 1.0, (3,)), lambda obs: obs, lambda seen: jnp.asarray(legal))
+    view = View(4, spaces.Box(-1.0, 1.0, (3,)), lambda obs: obs, lambda seen: jnp.asarray(legal), lambda batch: batch)
     imagination = Imagination(model, Scale(1e4, 11), 0.99, view)
     found = imagine(imagination, SearchSettings(kind, 8, rescale_values=True), params, obs, KEY, True)
     assert (np.asarray(found.policy)[~legal] == 0).all() and legal[np.arange(5), found.action].all()

@@ -75,6 +75,7 @@ class Config:
     dirichlet_alpha: Annotated[float, MoreThan(0)] = 0.3  # alpha of puct's noise at the root
     dirichlet_fraction: Annotated[float, Between(0, 1)] = 0.25  # epsilon: its share of the prior there
     temperature: Annotated[float | str, MoreThan(0)] = "linear(1, 0.25)"  # tau: actions are drawn from the search's policy ^ (1 / tau)
+    symmetries: bool = True  # of a game: learn from turned and mirrored boards too
     value_limit: Annotated[float, MoreThan(0)] = 300.0  # the largest value or reward, either way, that the model can say
     atoms: Annotated[int, AtLeast(2)] = 51  # numbers that a value's probabilities are of
     vf_coef: Annotated[float, AtLeast(0)] = 0.25  # weight of the value loss
@@ -164,7 +165,7 @@ def learn(parts: Parts, learnt: Averaged, replay: ReplayBuffer, rate: Float[Arra
     """One minibatch. Consumes the key."""
     c, imagination, num_envs = parts.config, parts.imagination, parts.spec.num_envs
     rows = drawn_rows(replay, key, c.batch_size, num_envs, c.unroll_steps + c.n_step + 1)
-    batch = unrolled_at(replay, rows, num_envs, c.unroll_steps, c.n_step, again=c.bootstrap == "network")
+    batch = imagination.view.turn(unrolled_at(replay, rows, num_envs, c.unroll_steps, c.n_step, again=c.bootstrap == "network"))
     targets = targets_of(batch, lambda seen: think(imagination, learnt.average, seen).value, imagination.discount, c.n_step)
     grads, metrics = jax.grad(muzero_loss, has_aux=True)(learnt.params, batch, targets, imagination, c.vf_coef)
     learnt, metrics["train/grad_norm"] = descend_averaged(parts.optimizer, rate, c.averaging, learnt, grads, metrics["train/loss"])
@@ -187,7 +188,7 @@ def build_parts(config: Config, spec: EnvSpec) -> Parts:
     if of_two and game is not None and game.has_chance:
         raise UserError(f"muzero plays games of two players without dice (connect_four, ...), which {spec.id} is not")
     actions, shape = int(spec.action_space.n), ModelShape(config.net_arch, config.cnn, config.state_size, config.width)
-    view = view_of(spec, actions)
+    view = view_of(spec, actions, config.symmetries)
     optimizer = clipped_adamw(config.max_grad_norm, config.weight_decay)
     follow, amounts = config.unroll_steps + config.n_step + 1, (config.train_freq, config.gradient_steps, spec.num_envs)
     plan = pace("muzero", config.buffer_size, config.learning_starts, *amounts, follow)
