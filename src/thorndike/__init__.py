@@ -45,6 +45,7 @@ _PUBLIC = {
     "AWAC": "thorndike.api",
     "QLearning": "thorndike.api",
     "AlphaZero": "thorndike.api",
+    "MuZero": "thorndike.api",
     "make": "thorndike.api",
     "evaluate": "thorndike.api",
     "check_env": "thorndike.api.checking",

@@ -4,7 +4,18 @@ Schrittwieser et al. 2020, "Mastering Atari, Go, chess and shogi by planning wit
 Gumbel: Danihelka et al. 2022, "Policy improvement by planning with Gumbel". Deviations from Schrittwieser et al.:
 
 1. The search may be Gumbel's (the default), whose policy improves even with few simulations.
-2. PLACEHOLDER
+2. Values are bootstrapped by what the running average of the network says of them now (``bootstrap="search"``: by what a search said when
+   they were played, as in the paper, which falls behind where values grow).
+3. What acts, and is exported, is that running average (``averaging``).
+4. Values are stretched by the best and the worst action of their node, not of the whole tree; in games too they are the paper's transformed
+   probabilities of atoms. A game's value changes its sign from each state to the next: players take turns.
+5. Sequences are drawn uniformly. Behind a termination the model is taught that nothing comes; behind a time limit it is taught nothing,
+   and the value goes on at the observation that was cut.
+6. States are rows of numbers, of images too; rewards are told by the state that they lead to. AdamW, gradients clipped.
+7. Actions are drawn at one temperature, a schedule over the run, in all moves of a game.
+
+Logs ``train/loss``, ``policy_loss``, ``value_loss``, ``reward_loss`` (of all K steps), ``target_entropy`` (of the search's policies),
+``value_mean`` (of the targets), ``grad_norm``, ``learning_rate``. Results and their commands: docs/algorithms/muzero.md.
 """
 
 from dataclasses import dataclass
@@ -13,30 +24,28 @@ from typing import Annotated, NamedTuple
 import gymnasium
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
-from gymnasium import spaces
-from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+from jaxtyping import Array, Float, Int, Key, PyTree
 
 from thorndike.errors import UserError
-from thorndike.functional.guards import accept_if, all_finite
+from thorndike.functional.descent import Averaged, averaged, clipped_adamw, descend_averaged
 from thorndike.functional.learning_dynamics import mean_square_gradient
 from thorndike.functional.policy_losses import weighted_mean
 from thorndike.functional.schedules import schedule
-from thorndike.functional.unrolled_targets import UnrolledTargets, scaled_gradient, unrolled_targets
+from thorndike.functional.unrolled_targets import UnrolledTargets
 from thorndike.functional.value_transform import Scale
-from thorndike.games.imagined_search import Imagination, imagine, think
+from thorndike.games.board_view import view_of
+from thorndike.games.imagined_search import Imagination, Thought, imagine, think
 from thorndike.games.search import SEARCHES, Found, SearchSettings
 from thorndike.networks.cnn import CNNS
 from thorndike.networks.hidden_layers import look_into
-from thorndike.networks.learned_model import ModelShape, learned_model
-from thorndike.networks.masking import MASK, allowed, check_mask, has_mask
+from thorndike.networks.learned_model import ModelShape, learned_model, unroll
 from thorndike.networks.torso import example_observation
 from thorndike.replay.age import key_to_look_by, mean_age
 from thorndike.replay.off_policy import repeated
 from thorndike.replay.pace import Pace, pace
 from thorndike.replay.uniform import ReplayBuffer, add, drawn_rows, init_replay, row_shapes
-from thorndike.replay.unrolled import Unrolled, unrolled_at
+from thorndike.replay.unrolled import Unrolled, targets_of, unrolled_at
 from thorndike.settings import AtLeast, Between, MoreThan, OneOf, check
 from thorndike.types import Algorithm, EnvSpec, Metrics, Needs, Noise, Observation, Rollout, Shared
 
@@ -55,6 +64,7 @@ class Config:
     gamma: Annotated[float, Between(0, 1)] = 0.99  # discount
     unroll_steps: Annotated[int, AtLeast(1)] = 5  # K: steps that the model is taught to look ahead
     n_step: Annotated[int, AtLeast(1)] = 10  # n: rewards summed before bootstrapping
+    bootstrap: Annotated[str, OneOf("network", "search")] = "network"  # by what the network says now, or a search said when it was played
     search: Annotated[str, OneOf(*SEARCHES)] = "gumbel"  # at the root: Gumbel's sequential halving, or PUCT with Dirichlet noise
     num_simulations: Annotated[int, AtLeast(1)] = 16  # of a search while learning
     eval_simulations: Annotated[int, AtLeast(0)] = 16  # when evaluated; 0: the policy's network alone
@@ -65,6 +75,7 @@ class Config:
     dirichlet_alpha: Annotated[float, MoreThan(0)] = 0.3  # alpha of puct's noise at the root
     dirichlet_fraction: Annotated[float, Between(0, 1)] = 0.25  # epsilon: its share of the prior there
     temperature: Annotated[float | str, MoreThan(0)] = "linear(1, 0.25)"  # tau: actions are drawn from the search's policy ^ (1 / tau)
+    symmetries: bool = True  # of a game: learn from turned and mirrored boards too
     value_limit: Annotated[float, MoreThan(0)] = 300.0  # the largest value or reward, either way, that the model can say
     atoms: Annotated[int, AtLeast(2)] = 51  # numbers that a value's probabilities are of
     vf_coef: Annotated[float, AtLeast(0)] = 0.25  # weight of the value loss
@@ -83,12 +94,9 @@ class Config:
 class State(NamedTuple):
     """What learning carries from one iteration to the next."""
 
-    params: PyTree
-    average: PyTree
-    """The running average of the parameters: what acts."""
-    opt_state: PyTree
+    learnt: Averaged
+    """Its average is what acts."""
     replay: ReplayBuffer
-    updates: Int[Array, ""]
     env_steps: Int[Array, ""]
 
 
@@ -103,16 +111,9 @@ def muzero_loss(
     params: PyTree, batch: Unrolled, targets: UnrolledTargets, imagination: Imagination, vf_coef: float
 ) -> tuple[Float[Array, ""], Metrics]:
     """Cross-entropies of policy, value and reward over K imagined steps: the paper's eq. 1, scaled as in its appendix G."""
-    model, scale, _ = imagination
-    first, steps = model.represent(params, batch.obs), batch.action.shape[0]
-
-    def follow(state: Array, action: Array) -> tuple[Array, Array]:
-        after = scaled_gradient(model.follow(params, state, action), 0.5)
-        return after, after
-
-    _, later = jax.lax.scan(follow, first, batch.action, unroll=True)
-    said = model.judge(params, jnp.concatenate([first[None], later]))
-    share = jnp.concatenate([jnp.ones((1, 1)), jnp.full((steps, 1), 1.0 / steps)]) * batch.valid
+    scale, steps = imagination.scale, batch.action.shape[0]
+    said = unroll(imagination.model, params, batch.obs, batch.action)
+    share = jnp.concatenate([jnp.ones((1, 1)), jnp.full((steps, 1), 1.0 / steps)]) * batch.valid[None]
 
     def cross_entropy(target: Array, logits: Array, weight: Array) -> Float[Array, ""]:
         each = -jnp.sum(target * jax.nn.log_softmax(logits), axis=-1)
@@ -125,8 +126,7 @@ def muzero_loss(
     entropy = -jnp.sum(batch.policy[0] * jnp.log(jnp.maximum(batch.policy[0], 1e-9)), axis=-1)
     metrics = {"train/loss": loss, "train/policy_loss": policy, "train/value_loss": value, "train/reward_loss": reward}
     metrics["train/target_entropy"] = weighted_mean(entropy, batch.valid)
-    metrics["train/value_mean"] = weighted_mean(targets.value[0], batch.valid)
-    return loss, metrics
+    return loss, metrics | {"train/value_mean": weighted_mean(targets.value[0], batch.valid)}
 
 
 class Parts(NamedTuple):
@@ -134,144 +134,104 @@ class Parts(NamedTuple):
 
     config: Config
     spec: EnvSpec
-    space: gymnasium.Space
-    """Of what the model sees."""
-    actions: int
     imagination: Imagination
     optimizer: optax.GradientTransformation
     plan: Pace
 
-    def see(self, obs: Observation) -> Observation:
-        """What the model sees of observations with any leading axes: of a game the board alone, and which moves are legal."""
-        if self.spec.game is None:
-            return obs
-        board = obs["board"]
-        return {"board": board.reshape((*board.shape[:-3], -1)), MASK: obs[MASK]}
-
-    def legal(self, seen: Observation) -> Bool[Array, "B actions"]:
-        """Which actions are allowed."""
-        if has_mask(self.space):
-            return allowed(seen)
-        return jnp.ones((jax.tree.leaves(seen)[0].shape[0], self.actions), bool)
-
     def look_ahead(self, simulations: int, explore: bool, params: PyTree, obs: Observation, key: Key[Array, ""]) -> Found:
         """A search from observations ``[B]``. Consumes the key."""
-        c, seen = self.config, self.see(obs)
+        c = self.config
         noise, bandit = (c.dirichlet_alpha, c.dirichlet_fraction, c.c_puct), (c.considered_moves, c.value_scale, c.rescale_values)
         settings = SearchSettings(c.search, simulations, *noise, *bandit)
-        return imagine(self.imagination, settings, params, seen, self.legal(seen), key, explore)
+        return imagine(self.imagination, settings, params, self.imagination.view.see(obs), key, explore)
 
 
 def init_state(parts: Parts, key: Key[Array, ""]) -> State:
     """Parameters and an empty ring. Consumes the key."""
-    params = parts.imagination.model.network.init(key, example_observation(parts.space))
-    found = {"policy": jax.ShapeDtypeStruct((parts.actions,), jnp.float32), "value": jax.ShapeDtypeStruct((), jnp.float32)}
-    row = row_shapes(parts.spec._replace(observation_space=parts.space), search=found)
-    replay, zero = init_replay(row, parts.plan.ring_steps, parts.spec.num_envs), jnp.zeros((), jnp.int32)
-    return State(params, jax.tree.map(jnp.copy, params), parts.optimizer.init(params), replay, zero, zero + 0)
+    model, (actions, space, *_), num_envs = parts.imagination.model, parts.imagination.view, parts.spec.num_envs
+    found = {"policy": jax.ShapeDtypeStruct((actions,), jnp.float32), "value": jax.ShapeDtypeStruct((), jnp.float32)}
+    replay = init_replay(row_shapes(parts.spec._replace(observation_space=space), search=found), parts.plan.ring_steps, num_envs)
+    return State(averaged(model.network.init(key, example_observation(space)), parts.optimizer), replay, jnp.zeros((), jnp.int32))
 
 
 def remember(parts: Parts, state: State, rollout: Rollout) -> State:
     """The rollout in the ring."""
-    seen = rollout._replace(obs=parts.see(rollout.obs), step=rollout.step._replace(next_obs=parts.see(rollout.step.next_obs)))
-    steps = parts.plan.rollout_length * parts.spec.num_envs
-    return state._replace(replay=add(state.replay, seen), env_steps=state.env_steps + steps)
+    see, step = parts.imagination.view.see, rollout.step
+    seen = rollout._replace(obs=see(rollout.obs), step=step._replace(next_obs=see(step.next_obs)))
+    return state._replace(replay=add(state.replay, seen), env_steps=state.env_steps + step.reward.size)
 
 
-def drawn(parts: Parts, replay: ReplayBuffer, average: PyTree, key: Key[Array, ""]) -> tuple[Unrolled, UnrolledTargets]:
-    """A minibatch and its targets. Consumes the key."""
-    c, num_envs = parts.config, parts.spec.num_envs
-    rows = drawn_rows(replay, key, c.batch_size, num_envs, c.unroll_steps + c.n_step + 1)
-    batch = unrolled_at(replay, rows, num_envs, c.unroll_steps, c.n_step)
-    cut = think(parts.imagination, average, batch.end_obs, parts.legal(batch.end_obs)).value
-    next_value = jnp.where(batch.done, cut, batch.value)
-    return batch, unrolled_targets(batch.reward, next_value, batch.terminated, batch.done, parts.imagination.discount, c.n_step)
-
-
-def learn(parts: Parts, state: State, replay: ReplayBuffer, key: Key[Array, ""]) -> tuple[State, Metrics]:
+def learn(parts: Parts, learnt: Averaged, replay: ReplayBuffer, rate: Float[Array, ""], key: Key[Array, ""]) -> tuple[Averaged, Metrics]:
     """One minibatch. Consumes the key."""
-    config = parts.config
-    batch, targets = drawn(parts, replay, state.average, key)
-    gradient = jax.value_and_grad(muzero_loss, has_aux=True)
-    (_, metrics), grads = gradient(state.params, batch, targets, parts.imagination, config.vf_coef)
-    rate = schedule(config.learning_rate)(state.env_steps / config.total_steps)
-    direction, opt_state = parts.optimizer.update(grads, state.opt_state, state.params)
-    metrics |= {"train/grad_norm": optax.tree.norm(grads), "train/learning_rate": rate}
-    params = jax.tree.map(lambda p, d: p - rate * d, state.params, direction)
-    average = jax.tree.map(lambda a, p: a + config.averaging * (p - a), state.average, params)
-    sound = all_finite(metrics["train/loss"], metrics["train/grad_norm"])
-    kept = accept_if(sound, (params, average, opt_state), (state.params, state.average, state.opt_state))
-    return state._replace(params=kept[0], average=kept[1], opt_state=kept[2]), metrics
+    c, imagination, num_envs = parts.config, parts.imagination, parts.spec.num_envs
+    rows = drawn_rows(replay, key, c.batch_size, num_envs, c.unroll_steps + c.n_step + 1)
+    batch = imagination.view.turn(unrolled_at(replay, rows, num_envs, c.unroll_steps, c.n_step, again=c.bootstrap == "network"))
+    targets = targets_of(batch, lambda seen: think(imagination, learnt.average, seen).value, imagination.discount, c.n_step)
+    grads, metrics = jax.grad(muzero_loss, has_aux=True)(learnt.params, batch, targets, imagination, c.vf_coef)
+    learnt, metrics["train/grad_norm"] = descend_averaged(parts.optimizer, rate, c.averaging, learnt, grads, metrics["train/loss"])
+    return learnt, metrics
 
 
 def look_at(parts: Parts, state: State) -> Metrics:
     """Dead units, ranks and gradient norms of the model, and how old what it learns from is."""
-    c, network = parts.config, parts.imagination.model.network
-    rows = drawn_rows(state.replay, key_to_look_by(state.env_steps), c.batch_size, parts.spec.num_envs, 1)
-    seen = jax.tree.map(lambda x: x[rows], state.replay.rows["obs"])
-    found = look_into(network, state.params, seen, mean_square_gradient(state.opt_state))
+    rows = drawn_rows(state.replay, key_to_look_by(state.env_steps), parts.config.batch_size, parts.spec.num_envs, 1)
+    seen, learnt = jax.tree.map(lambda x: x[rows], state.replay.rows["obs"]), state.learnt
+    found = look_into(parts.imagination.model.network, learnt.params, seen, mean_square_gradient(learnt.opt_state))
     return found | {"train/replay_age": mean_age(state.replay, parts.spec.num_envs)}
 
 
 def build_parts(config: Config, spec: EnvSpec) -> Parts:
     """The learner's parts. Raises ``UserError`` for settings or spaces that do not fit."""
-    if not isinstance(spec.action_space, spaces.Discrete):
+    if not isinstance(spec.action_space, gymnasium.spaces.Discrete):
         raise UserError(f"muzero takes Discrete actions; {spec.id} has {spec.action_space}; ppo, sac and td3 take the others")
-    space, discount, actions = spec.observation_space, config.gamma, int(spec.action_space.n)
-    if spec.game is not None:
-        if spec.game.has_chance and spec.game.num_players == 2:
-            raise UserError(f"muzero plays games of two players without dice (connect_four, ...), which {spec.id} is not")
-        size = int(np.prod(spec.game.observation_shape))
-        space = spaces.Dict({"board": spaces.Box(-np.inf, np.inf, (size,), np.float32), MASK: spaces.MultiBinary(actions)})
-        discount = -config.gamma if spec.game.num_players == 2 else config.gamma
-    if has_mask(space):
-        check_mask(spec._replace(observation_space=space))
-    model = learned_model(space, actions, config.atoms, ModelShape(config.net_arch, config.cnn, config.state_size, config.width))
-    optimizer = optax.chain(
-        optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam(), optax.add_decayed_weights(config.weight_decay)
-    )
+    game, of_two = spec.game, spec.game is not None and spec.game.num_players == 2
+    if of_two and game is not None and game.has_chance:
+        raise UserError(f"muzero plays games of two players without dice (connect_four, ...), which {spec.id} is not")
+    actions, shape = int(spec.action_space.n), ModelShape(config.net_arch, config.cnn, config.state_size, config.width)
+    view = view_of(spec, actions, config.symmetries)
+    optimizer = clipped_adamw(config.max_grad_norm, config.weight_decay)
     follow, amounts = config.unroll_steps + config.n_step + 1, (config.train_freq, config.gradient_steps, spec.num_envs)
     plan = pace("muzero", config.buffer_size, config.learning_starts, *amounts, follow)
-    imagination = Imagination(model, Scale(config.value_limit, config.atoms), discount)
-    return Parts(config, spec, space, actions, imagination, optimizer, plan)
+    model, scale = learned_model(view.space, actions, config.atoms, shape), Scale(config.value_limit, config.atoms)
+    return Parts(config, spec, Imagination(model, scale, -config.gamma if of_two else config.gamma, view), optimizer, plan)
 
 
 def muzero(config: Config, spec: EnvSpec) -> Algorithm:
     """MuZero for an environment or a game with Discrete actions. Raises ``UserError`` for other actions, and games of two with dice."""
     parts = build_parts(config, spec)
-    temperature, plan = schedule(config.temperature), parts.plan
+    learning_rate, temperature, plan = schedule(config.learning_rate), schedule(config.temperature), parts.plan
+
+    def thought(actor: Actor, obs: Observation) -> Thought:
+        return think(parts.imagination, actor.params, parts.imagination.view.see(obs))
 
     def actor(state: State) -> Actor:
-        return Actor(state.average, temperature(state.env_steps / config.total_steps))
+        return Actor(state.learnt.average, temperature(state.env_steps / config.total_steps))
 
-    def act(actor: Actor, memory: PyTree, obs: Observation, noise: Noise) -> tuple[PyTree, PyTree, PyTree]:
+    def act(actor: Actor, memory: PyTree, obs: Observation, noise: Noise) -> tuple[PyTree, Int[Array, " B"], PyTree]:
         found = parts.look_ahead(config.num_simulations, True, actor.params, obs, noise["search"].numbers)
         tempered = jnp.log(jnp.maximum(found.policy, 1e-30)) / actor.temperature
         action = jnp.argmax(tempered + noise["choice"], axis=-1).astype(jnp.int32)
         return memory, action, {"search": {"policy": found.policy, "value": found.value}}
 
-    def thought(actor: Actor, obs: Observation) -> tuple[Float[Array, "B actions"], Float[Array, " B"]]:
-        seen = parts.see(obs)
-        return think(parts.imagination, actor.params, seen, parts.legal(seen))[1:]
-
-    def greedy(actor: Actor, memory: PyTree, obs: Observation, noise: Noise) -> tuple[PyTree, PyTree, PyTree]:
+    def greedy(actor: Actor, memory: PyTree, obs: Observation, noise: Noise) -> tuple[PyTree, Int[Array, " B"], PyTree]:
         if config.eval_simulations == 0:
-            return memory, jnp.argmax(thought(actor, obs)[0], axis=-1).astype(jnp.int32), {}
+            return memory, jnp.argmax(thought(actor, obs).logits, axis=-1).astype(jnp.int32), {}
         return memory, parts.look_ahead(config.eval_simulations, False, actor.params, obs, noise["search"].numbers).action, {}
 
     def draw(key: Key[Array, ""], steps: int) -> Noise:
         key_search, key_choice = jax.random.split(key)
-        choice = jax.random.gumbel(key_choice, (steps, spec.num_envs, parts.actions))
+        choice = jax.random.gumbel(key_choice, (steps, spec.num_envs, parts.imagination.view.actions))
         return {"search": Shared(jax.random.split(key_search, steps)), "choice": choice}
 
     def update(state: State, rollout: Rollout, key: Key[Array, ""]) -> tuple[State, Metrics]:
+        rate = learning_rate(state.env_steps / config.total_steps)
         state = remember(parts, state, rollout)
-        replay = state.replay
         # One key more than updates: from a single one the compiler would take the sampling out of the loop (see ``repeated``).
         keys = jax.random.split(key, plan.gradient_steps + 1)
-        light = state._replace(replay=())
-        light, metrics = repeated(lambda held, i: learn(parts, held, replay, keys[i]), light, plan.gradient_steps, state.updates >= 0)
-        return light._replace(replay=replay, updates=state.updates + plan.gradient_steps), metrics
+        learnt, metrics = repeated(
+            lambda learnt, i: learn(parts, learnt, state.replay, rate, keys[i]), state.learnt, plan.gradient_steps, state.env_steps >= 0
+        )
+        return state._replace(learnt=learnt), metrics | {"train/learning_rate": rate}
 
     return Algorithm(
         init=lambda key: init_state(parts, key),
@@ -280,10 +240,10 @@ def muzero(config: Config, spec: EnvSpec) -> Algorithm:
         draw=draw,
         act=act,
         greedy=greedy,
-        value=lambda actor, obs: thought(actor, obs)[1],
+        value=lambda actor, obs: thought(actor, obs).value,
         update=update,
         observe=lambda state, rollout, key: (remember(parts, state, rollout), {}),
         needs=Needs(rollout_length=plan.rollout_length, on_policy=False, warmup_iterations=plan.warmup_iterations),
-        probabilities=lambda actor, memory, obs: jax.nn.softmax(thought(actor, obs)[0]),
+        probabilities=lambda actor, memory, obs: jax.nn.softmax(thought(actor, obs).logits),
         dynamics=lambda state, rollout: look_at(parts, state),
     )

@@ -36,7 +36,7 @@ def agent_player(
     an algorithm whose policy does not tell probabilities of moves.
     """
     if algorithm.probabilities is None:
-        raise UserError(f"{name} tells no probabilities of moves, so it cannot play here: train it with alphazero, or with ppo")
+        raise UserError(f"{name} tells no probabilities of moves, so it cannot play here: train it with alphazero, muzero or ppo")
     evaluate = _evaluation(game, algorithm, algorithm.probabilities, wrapper, statistics)
     settings = _settings(config, max(simulations, 1))
     searches = simulations > 0 and game.num_players == 2 and not game.has_chance

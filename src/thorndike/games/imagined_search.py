@@ -4,9 +4,10 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import mctx
-from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+from jaxtyping import Array, Float, Int, Key, PyTree
 
 from thorndike.functional.value_transform import Scale
+from thorndike.games.board_view import View
 from thorndike.games.search import Found, SearchSettings, grow
 from thorndike.networks.learned_model import Model
 from thorndike.networks.masking import FORBIDDEN
@@ -20,6 +21,8 @@ class Imagination(NamedTuple):
     scale: Scale
     discount: Number
     """From one state to the next: negative where two take turns, for what is good for one is bad for the other."""
+    view: View
+    """What the model is shown of observations, and which actions are legal there."""
 
 
 class Thought(NamedTuple):
@@ -30,25 +33,20 @@ class Thought(NamedTuple):
     value: Float[Array, " B"]
 
 
-def think(imagination: Imagination, params: PyTree, obs: Observation, legal: Bool[Array, "B actions"]) -> Thought:
-    """States, logits of the legal actions, values."""
-    state = imagination.model.represent(params, obs)
+def think(imagination: Imagination, params: PyTree, seen: Observation) -> Thought:
+    """States, logits of the legal actions, values of what is seen ``[B, ...]``."""
+    state = imagination.model.represent(params, seen)
     said = imagination.model.judge(params, state)
-    return Thought(state, jnp.where(legal, said.policy, FORBIDDEN), imagination.scale.number(said.value))
+    logits = jnp.where(imagination.view.legal(seen), said.policy, FORBIDDEN)
+    return Thought(state, logits, imagination.scale.number(said.value))
 
 
 def imagine(
-    imagination: Imagination,
-    settings: SearchSettings,
-    params: PyTree,
-    obs: Observation,
-    legal: Bool[Array, "B actions"],
-    key: Key[Array, ""],
-    explore: bool,
+    imagination: Imagination, settings: SearchSettings, params: PyTree, seen: Observation, key: Key[Array, ""], explore: bool
 ) -> Found:
-    """Search from observations ``[B]``; which actions are legal is known of these alone. Consumes the key."""
-    model, scale, discount = imagination
-    thought = think(imagination, params, obs, legal)
+    """Search from what is seen ``[B, ...]``; which actions are legal is known there alone. Consumes the key."""
+    model, scale, discount, view = imagination
+    thought = think(imagination, params, seen)
     root = mctx.RootFnOutput(prior_logits=thought.logits, value=thought.value, embedding=thought.state)
 
     def recurrent(
@@ -61,4 +59,4 @@ def imagine(
         factor = jnp.broadcast_to(jnp.asarray(discount, jnp.float32), value.shape)
         return mctx.RecurrentFnOutput(reward=reward, discount=factor, prior_logits=said.policy, value=value), after
 
-    return grow(settings, params, root, recurrent, legal, key, explore)
+    return grow(settings, params, root, recurrent, view.legal(seen), key, explore)

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PyTree
 
+from thorndike.functional.unrolled_targets import scaled_gradient
 from thorndike.networks.dense import dense
 from thorndike.networks.hidden_layers import SHOWN, hidden_layers
 from thorndike.networks.network import Network
@@ -118,3 +119,18 @@ def learned_model(space: gymnasium.Space, actions: int, atoms: int, shape: Model
         return lambda params, *inputs: module.apply({"params": params}, *inputs, method=method)
 
     return Model(network, part(LearnedModel.represent), part(LearnedModel.follow), part(LearnedModel.judge))
+
+
+def unroll(model: Model, params: PyTree, obs: Observation, actions: Int[Array, "K M"]) -> Judgement:
+    """What the model says of observations ``[M, ...]`` and of the states after each of K actions: ``[K + 1, M, ...]``.
+
+    Gradients are halved at each step (appendix G of the paper).
+    """
+
+    def follow(state: Float[Array, "M H"], action: Int[Array, " M"]) -> tuple[Float[Array, "M H"], Float[Array, "M H"]]:
+        after = scaled_gradient(model.follow(params, state, action), 0.5)
+        return after, after
+
+    first = model.represent(params, obs)
+    _, later = jax.lax.scan(follow, first, actions, unroll=True)
+    return model.judge(params, jnp.concatenate([first[None], later]))
