@@ -72,6 +72,11 @@ def test_dpo_and_eval(folder: Path, reward: Path, capsys: pytest.CaptureFixture[
     words = ["dpo", str(folder / "base"), "--data", str(folder / "preferences.jsonl"), "--out", str(folder / "dpo")]
     found = answer(capsys, *words, "--set=batch_size=8", "--set=learning_rate=0.01", "--set=total_steps=12")
     assert found["status"] == "finished" and found["steps"] == 12 and found["train/reward_margin"] > 0
+    table = {"model": "base", "data": "preferences.jsonl", "out": "dpo"}
+    lines = [f'{name} = "{folder / path}"' for name, path in table.items()]
+    (folder / "way.toml").write_text("\n".join(["[dpo]", *lines, "batch_size = 8", "learning_rate = 0.01", "total_steps = 5"]))
+    same = answer(capsys, "dpo", "--config", str(folder / "way.toml"), "--set=total_steps=12")
+    assert same["steps"] == 12, "a file that says the same is the same request, which is done"
     words = ["eval", str(folder / "dpo" / "model"), "--base", str(folder / "base"), "--prompts", str(folder / "prompts.jsonl")]
     seen = answer(capsys, *words, "--reward", str(reward), "--reward", f"{folder}/rewards.py:length", "--max-new-tokens", "4")
     assert seen["kl"] > 0.01 and set(seen["judged"]) == {str(reward), f"{folder}/rewards.py:length"} and seen["prompts"] == 4
