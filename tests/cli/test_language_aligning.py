@@ -4,11 +4,14 @@ import json
 from pathlib import Path
 
 import jax
+import numpy as np
 import pytest
 
 from thorndike.cli.main import main
 from thorndike.language.decoder import initial_params
 from thorndike.language.model import LanguageModel, load_model, save_model
+from thorndike.language.preferences.assignment import Plan, next_assignments
+from thorndike.language.preferences.store import Store
 from thorndike.language.pretraining import Config, small_llama, train_tokenizer
 from thorndike.language.reward_files import load_reward_model
 
@@ -82,6 +85,34 @@ def test_dpo_and_eval(folder: Path, reward: Path, capsys: pytest.CaptureFixture[
     assert seen["kl"] > 0.01 and set(seen["judged"]) == {str(reward), f"{folder}/rewards.py:length"} and seen["prompts"] == 4
 
 
+def test_people_are_asked_first_where_the_members_disagree(folder: Path, reward: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rows = [{"prompt": "The film", "candidates": [f" was {one}", f" is {other}"]} for one in "abc" for other in "xyz"]
+    (folder / "candidates.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    db = ["--db", str(folder / "asked.db")]
+    answer(capsys, "import", str(folder / "candidates.jsonl"), *db)
+    found = answer(capsys, "ask", *db, "--reward", str(reward))
+    assert found["items"] == 9 and 0 < found["mean"] <= found["highest"] <= 0.5
+    model = load_reward_model(reward)
+    with Store(folder / "asked.db") as store:
+        project = store.projects()["default"]
+        prompts, candidates = store.contents(project)
+        by_hand = {}
+        for number, question in store.questions(project).items():
+            texts = [model.tokenizer.encode(prompts[question.prompt]["text"]) for _ in question.candidates]
+            texts = [
+                [*before, *model.tokenizer.encode(candidates[each].content["text"], special=False), model.tokenizer.eos_id]
+                for before, each in zip(texts, question.candidates, strict=True)
+            ]
+            one, other = model.all_scores(texts).T
+            by_hand[number] = np.std([1 / (1 + np.exp(-(a - b))) for a, b in zip(one, other, strict=True)])
+        assert found["highest"] == pytest.approx(max(by_hand.values()), rel=1e-5)
+        first = next_assignments(store, project, store.rater("anna"), 1, Plan(gold=0, repeats=0))
+        (shown,) = store.shown(first)
+        most = store.questions(project)[max(by_hand, key=lambda number: by_hand[number])]
+        wanted = {candidates[each].content["text"] for each in most.candidates}
+        assert {each["text"] for each in shown.candidates} == wanted
+
+
 def test_mistakes_are_one_line(folder: Path, reward: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     base, prompts = str(folder / "base"), str(folder / "prompts.jsonl")
     ppo = ["ppo", base, "--prompts", prompts, "--out", str(tmp_path / "x"), *SMALL]
@@ -101,6 +132,7 @@ def test_mistakes_are_one_line(folder: Path, reward: Path, capsys: pytest.Captur
         (["dpo", base, "--data", str(tmp_path / "odd.jsonl"), "--out", str(tmp_path / "y")], "odd.jsonl, row 1: p_chosen is 2"),
         (["reward", base, "--data", prompts, "--out", str(tmp_path / "y")], "expected a preference"),
         (["eval", str(reward), "--base", base, "--prompts", prompts, "--reward", str(reward)], "not of the shape"),
+        (["ask", "--db", str(folder / "p.db"), "--reward", str(reward)], "no project 'default'"),
         (["demo", "--out", str(tmp_path / "z"), "--learners", "pppo"], "did you mean 'ppo'"),
     ]
     for words, expected in cases:

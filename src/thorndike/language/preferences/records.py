@@ -75,8 +75,8 @@ def _checked(rows: Sequence[Row], where: str) -> Records:
 def write_records(path: str | Path, rows: Iterable[Mapping[str, object]]) -> int:
     """Write rows to a file, its form told by its ending; how many they were. The file is there as a whole, or as it was before.
 
-    In CSV what is no text is written as JSON, and ``read_records`` reads it back. Raises ``UserError`` for a text that no file can hold, and
-    where nothing can be written.
+    In CSV what is no text is written as JSON, and ``read_records`` reads it back. Raises ``UserError`` for a text that no file can hold,
+    and where nothing can be written.
     """
     path = Path(path)
     written = [dict(row) for row in rows]
