@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from thorndike.cli.answer import Answer
 from thorndike.cli.language.arguments import add_device_argument, add_settings_argument, given_settings, prepare_device, settings_in_words
+from thorndike.cli.language.config_file import parse_with_config
 from thorndike.cli.parser import Parser, positive_whole, seed_number
 from thorndike.errors import UserError
 
@@ -55,7 +56,7 @@ def run_policy_verb(verb: str, summary: str, words: Sequence[str]) -> Answer:
     parser.add_argument("--prompts", type=Path, action="append", required=True, metavar="FILE", help="rows with a column prompt")
     parser.add_argument("--max-kl", type=_positive, metavar="NATS", help="stop beyond, and keep the last policy that was not")
     parser.add_argument("--no-limits", action="store_true", help="do not stop on disagreement, repetition or changed length either")
-    options = parser.parse(words)
+    options = parse_with_config(parser, words, verb, module)
     settings = given_settings(options.settings, module)
     if verb == "rloo" and "baseline" in settings:
         raise UserError("rloo is GRPO with baseline=leave_one_out; to choose another baseline: thorndike language grpo")

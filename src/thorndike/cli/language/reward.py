@@ -6,6 +6,7 @@ from pathlib import Path
 from thorndike.cli.answer import Answer
 from thorndike.cli.language.aligning import add_training_arguments, lora_of, teller
 from thorndike.cli.language.arguments import given_settings, prepare_device, settings_in_words
+from thorndike.cli.language.config_file import parse_with_config
 from thorndike.cli.parser import Parser, positive_whole
 
 EXAMPLES = """\
@@ -25,7 +26,7 @@ def run(words: Sequence[str]) -> Answer:
         "--held-out", type=Path, action="append", default=[], metavar="FILE", help="rows to measure with (default: a tenth)"
     )
     parser.add_argument("--members", type=positive_whole, default=1, metavar="N", help="models whose mean is the reward (default: 1)")
-    options = parser.parse(words)
+    options = parse_with_config(parser, words, "reward", "reward_model")
     settings = given_settings(options.settings, "reward_model")
     prepare_device(options.device, options.model)
     from thorndike.language.aligning import train_reward_model
