@@ -1,7 +1,7 @@
 """A game learnt for a stated time, and how strong its checkpoints are in a pool with random moves, plain tree search and an engine.
 
-python benchmarks/curve.py go_9x9 --budget 240    into benchmarks/results/curve.json and docs/images/curve_go_9x9.png
-python benchmarks/curve.py chess --budget 240
+python benchmarks/curve.py go_9x9 --budget 90    into benchmarks/results/curve.json and docs/images/curve_go_9x9.png
+python benchmarks/curve.py chess --budget 90
 
 CPU-seconds are those of playing and learning on one core, compiling left out. Everybody plays everybody, from random openings
 that are played twice with colours swapped; ratings are fitted to all games at once, and the random player's is set to 0.
@@ -18,7 +18,7 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from side_by_side import TOGETHER, Side, engine_side, mcts_side, play, together
+from side_by_side import Side, engine_side, mcts_side, play, together
 from thorndike.algorithms.alphazero import Config, alphazero
 from thorndike.environments.wrappers import chain
 from thorndike.games.environment import game_environment, observed_position
@@ -33,7 +33,7 @@ from thorndike.types import Algorithm
 
 ROOT = Path(__file__).parents[1]
 RESULT = ROOT / "benchmarks" / "results" / "curve.json"
-CHECKPOINTS = (0.0, 0.125, 0.25, 0.5, 1.0)
+CHECKPOINTS = (0.0, 0.25, 0.5, 1.0)
 """Shares of the budget."""
 SHARED = {"num_simulations": 16, "fast_simulations": 6, "full_search_fraction": 0.5, "eval_simulations": 32, "gradient_steps": 8}
 SHARED |= {"n_steps": 8, "batch_size": 256, "learning_rate": "linear(1e-3, 3e-4)", "blocks": 1, "buffer_size": 60_000}
@@ -55,9 +55,9 @@ PLANS = {
     "go_9x9": Plan(
         64,
         {**SHARED, "tower": "patches", "width": 128, "learning_starts": 5_000, "temperature_moves": 12},
-        ("random", "mcts:16", "gnugo:level=1"),
+        ("random", "mcts:4", "gnugo:level=1"),
         4,
-        300_000,
+        120_000,
     ),
     "chess": Plan(
         32,
@@ -109,19 +109,19 @@ def iteration_counts(warmup: int) -> Iterator[int]:
         yield 4
 
 
-def sides(rules: Game, plan: Plan, algorithm: Algorithm, kept: list[Checkpoint]) -> list[Side]:
+def sides(rules: Game, plan: Plan, algorithm: Algorithm, kept: list[Checkpoint], size: int) -> list[Side]:
     """Checkpoints, weakest first, then the others."""
     noise = jax.tree.map(lambda x: x[0], algorithm.draw(jax.random.key(0), 1))
     observed = jax.vmap(lambda position: observed_position(rules, position))
-    decide = jax.jit(lambda actor, positions: algorithm.greedy(actor, algorithm.memory(TOGETHER), observed(positions), noise)[1])
+    decide = jax.jit(lambda actor, positions: algorithm.greedy(actor, algorithm.memory(size), observed(positions), noise)[1])
 
     def own(actor: PyTree) -> Side:
-        return Side("", together(lambda positions, number: decide(actor, positions)))
+        return Side("", together(lambda positions, number: decide(actor, positions), size))
 
     found = [own(each.actor)._replace(name=f"{each.cpu_s:.0f} CPU-s") for each in kept]
     for text in plan.opponents:
         is_plain = text == "random" or text.startswith("mcts:")
-        found.append(mcts_side(rules, int(text.partition(":")[2] or 0)) if is_plain else engine_side(text, rules))
+        found.append(mcts_side(rules, int(text.partition(":")[2] or 0), size) if is_plain else engine_side(text, rules))
     return found
 
 
@@ -129,7 +129,7 @@ def measure(name: str, budget: float, games: int, seed: int) -> dict[str, object
     """Train, play, rate."""
     rules, plan = game(name), PLANS[name]
     algorithm, kept = learnt(rules, plan, budget, seed)
-    pool, matches, rows = sides(rules, plan, algorithm, kept), [], []
+    pool, matches, rows = sides(rules, plan, algorithm, kept, games // 2), [], []
     for first in range(len(pool)):
         for second in range(first + 1, len(pool)):
             scores = play(rules, pool[first], pool[second], games, plan.opening_plies, seed).scores
@@ -180,8 +180,8 @@ def draw(name: str, row: dict) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("game", choices=tuple(PLANS))
-    parser.add_argument("--budget", type=float, default=240, help="CPU-seconds of training")
-    parser.add_argument("--games", type=int, default=20, help="of each pair")
+    parser.add_argument("--budget", type=float, default=90, help="CPU-seconds of training")
+    parser.add_argument("--games", type=int, default=16, help="of each pair")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     results = json.loads(RESULT.read_text(encoding="utf-8")) if RESULT.exists() else {}

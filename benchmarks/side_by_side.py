@@ -22,7 +22,7 @@ from thorndike.games.search import SearchSettings, by_playouts, search
 from thorndike.networks.masking import FORBIDDEN
 
 TOGETHER = 50
-"""Positions that are searched at once."""
+"""Positions that are searched at once, where nobody says otherwise: half of the games of a match wait for the same player."""
 Answer = Callable[[Sequence[Turn]], list[int]]
 
 
@@ -46,7 +46,7 @@ def run_side(name: str, game: Game, run: Path, simulations: int) -> Side:
     return Side(name, together(lambda positions, number: decide(actor, positions)))
 
 
-def mcts_side(game: Game, simulations: int) -> Side:
+def mcts_side(game: Game, simulations: int, size: int = TOGETHER) -> Side:
     """Plain tree search by random playouts; with 0, random moves."""
     settings, evaluate, base = SearchSettings("puct", simulations), by_playouts(game), jax.random.key(1)
 
@@ -58,7 +58,7 @@ def mcts_side(game: Game, simulations: int) -> Side:
         return search(game, evaluate, settings, (), positions, key, explore=False).action
 
     name = f"mcts:simulations={simulations}" if simulations else "random"
-    return Side(name, together(lambda positions, number: decide(positions, jax.random.fold_in(base, number))))
+    return Side(name, together(lambda positions, number: decide(positions, jax.random.fold_in(base, number)), size))
 
 
 def engine_side(text: str, game: Game) -> Side:
@@ -67,16 +67,16 @@ def engine_side(text: str, game: Game) -> Side:
     return Side(text, lambda turns: [player.choose(turn).action for turn in turns], player.close)
 
 
-def together(decide: Callable[[Position, int], jax.Array]) -> Answer:
-    """Positions are searched ``TOGETHER`` at a time, the last ones beside copies of the first."""
+def together(decide: Callable[[Position, int], jax.Array], size: int = TOGETHER) -> Answer:
+    """``decide``: ``size`` positions and how often it was asked -> moves. The last ones are searched beside copies."""
     asked = 0
 
     def answer(turns: Sequence[Turn]) -> list[int]:
         nonlocal asked
         actions: list[int] = []
-        for begin in range(0, len(turns), TOGETHER):
-            part = [turn.position for turn in turns[begin : begin + TOGETHER]]
-            filled = part + [part[0]] * (TOGETHER - len(part))
+        for begin in range(0, len(turns), size):
+            part = [turn.position for turn in turns[begin : begin + size]]
+            filled = part + [part[0]] * (size - len(part))
             positions = jax.tree.map(lambda *leaves: np.stack(leaves), *filled)
             asked += 1
             actions += np.asarray(decide(positions, asked))[: len(part)].tolist()
