@@ -9,11 +9,7 @@ import json
 import sys
 from pathlib import Path
 
-import jax
-
 import thorndike as td
-from thorndike.api.building import build_algorithm
-from thorndike.games.environment import observed_position
 from thorndike.games.tic_tac_toe import TIC_TAC_TOE
 
 ROOT = Path(__file__).parents[1]
@@ -41,12 +37,7 @@ def walked(run: Path, simulations: int) -> dict:
     sys.path.insert(0, str(ROOT / "tests"))
     import tic_tac_toe_lines as lines
 
-    loaded = td.load(run)
-    policy = loaded.policy
-    algorithm = build_algorithm("muzero", {**loaded.facts["config"], "eval_simulations": simulations}, policy.spec, None)
-    actor, noise = jax.tree.map(lambda leaf: leaf[0], policy.actors), policy.noise(jax.random.key(0), lines.SIDE_BY_SIDE)
-    see = jax.vmap(lambda position: observed_position(TIC_TAC_TOE, position))
-    choose = jax.jit(lambda positions: algorithm.greedy(actor, (), see(positions), noise)[1])
+    choose = lines.chooser(run, simulations)
     first, second = (lines.walk(choose, agent) for agent in (0, 1))
     return {"first": first._asdict(), "second": second._asdict(), "keeps_the_value": lines.optimal_share(choose)}
 

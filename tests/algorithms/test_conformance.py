@@ -302,7 +302,20 @@ class Bound(NamedTuple):
     traces: list[str]
 
 
-SLOW = ("ppo, bonuses", "dqn, hindsight", "td3", "crossq", "dqn, lstm", "a2c, gru", "a3c, gru", "trpo", "pqn", "td3_bc", "cql, Box")
+SLOW = (
+    "ppo, bonuses",
+    "dqn, hindsight",
+    "td3",
+    "crossq",
+    "dqn, lstm",
+    "a2c, gru",
+    "a3c, gru",
+    "trpo",
+    "pqn",
+    "td3_bc",
+    "cql, Box",
+    "muzero",
+)
 """Cases whose machinery another one runs too."""
 
 

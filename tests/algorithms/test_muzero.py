@@ -124,11 +124,12 @@ def test_a_run_is_saved_loaded_and_gone_on_with(environment: str, engine: str, t
     assert policy.policy.spec.action_space.contains(int(action)) and np.isfinite(policy.value(obs))
 
 
-def chooser(run: Path, simulations: int) -> lines.Choose:
-    """The policy of a run, with that many simulations a move."""
-    loaded = td.load(run)
-    policy = loaded.policy
-    algorithm = build_algorithm("muzero", {**loaded.facts["config"], "eval_simulations": simulations}, policy.spec, None)
-    actor, noise = jax.tree.map(lambda leaf: leaf[0], policy.actors), policy.noise(jax.random.key(0), lines.SIDE_BY_SIDE)
-    see = jax.vmap(lambda position: observed_position(TIC_TAC_TOE, position))
-    return jax.jit(lambda positions: algorithm.greedy(actor, (), see(positions), noise)[1])
+@pytest.mark.slow
+def test_hardly_a_line_of_tic_tac_toe_is_lost_by_who_was_never_told_the_rules(tmp_path: Path, capsys: pytest.CaptureFixture):
+    result = td.train("muzero", "tic_tac_toe", output=tmp_path)
+    for simulations in (0, 64):
+        choose = lines.chooser(result.run, simulations)
+        walked = [lines.walk(choose, agent) for agent in (0, 1)]
+        with capsys.disabled():
+            print(f"\n{result.cpu_s:.0f} CPU-s; {simulations} simulations: first {walked[0]}, second {walked[1]}")
+        assert walked[0].lost + walked[1].lost <= LOST
