@@ -24,7 +24,7 @@ ROOT = Path(__file__).parents[1]
 RESULTS, PAGE = ROOT / "benchmarks" / "results" / "clips.json", ROOT / "docs" / "clips.md"
 EPISODES, CHOICES, ROUNDS = 100, 500, 5
 SETTINGS = {"learning_rate": "linear(1e-3, 0)"}
-"""Of both learners, beside the preset's: with its constant rate PPO falls off again after 150,000 steps, on either reward."""
+"""Of both learners, beside the preset's: at its constant rate one seed on a learnt reward fell from -170 to -464 late in 200,000 steps."""
 START, END = "<!-- clips:start -->", "<!-- clips:end -->"
 
 
