@@ -19,10 +19,11 @@ def add_clip_arguments(parser: Parser) -> None:
     parser.add_argument("--question", metavar="TEXT", help="what people are asked (default: which does better what you want)")
 
 
-def add_rater_arguments(parser: Parser) -> None:
-    """How a program chooses."""
+def add_rater_arguments(parser: Parser, temperature: str = "--temperature") -> None:
+    """How a program chooses; ``temperature`` is that flag's name, which settings of learners have, too."""
     parser.add_argument(
-        "--temperature",
+        temperature,
+        dest="temperature",
         type=at_least_zero,
         default=1.0,
         metavar="T",

@@ -39,7 +39,6 @@ def run(words: Sequence[str]) -> Answer:
     """Go as far as it goes, and say what is next."""
     parser = Parser("clips train", "Train an agent from choices between clips, in rounds.", EXAMPLES.format(settings=settings_in_words()))
     algorithm = named_algorithm(words)
-    add_training_arguments(parser, read_config_fields(algorithm) if algorithm in ALGORITHMS else {})
     parser.add_argument("--to", type=Path, required=True, metavar="DIR", help="the folder that keeps clips, choices, rewards and the run")
     parser.add_argument("--choices", type=positive_whole, default=CHOICES, metavar="N", help=f"in all (default: {CHOICES})")
     parser.add_argument(
@@ -47,10 +46,12 @@ def run(words: Sequence[str]) -> Answer:
     )
     add_clip_arguments(parser)
     parser.add_argument("--simulate", action="store_true", help="a program judges by the environment's own reward; nothing is filmed")
-    add_rater_arguments(parser)
+    add_rater_arguments(parser, "--rater-temperature")
     parser.add_argument(
         "--reward-set", action="append", default=[], metavar="NAME=VALUE", help="a setting of the reward's networks; may be repeated"
     )
+    # After the others: a learner's settings are flags too, where they are not taken.
+    add_training_arguments(parser, read_config_fields(algorithm) if algorithm in ALGORITHMS else {})
     options = parser.parse(words)
     algorithm, environment = names(options)
     settings, env_kwargs = given_settings(options, algorithm), given_env_kwargs(options.env_set)
@@ -62,7 +63,7 @@ def run(words: Sequence[str]) -> Answer:
     )
     check_preset(algorithm, environment, options.preset)
     if not options.simulate and (options.temperature, options.error_rate) != (1.0, 0.0):
-        raise UserError("--temperature and --error-rate are of a program that judges: give --simulate, or leave them out")
+        raise UserError("--rater-temperature and --error-rate are of a program that judges: give --simulate, or leave them out")
     from thorndike.api.clip_rounds import QUESTION, SimulatedRater, train_on_choices
 
     found = train_on_choices(
