@@ -47,6 +47,19 @@ def load_model(folder: str | Path, *, dtype: Dtype | None = None, adapter: str |
     return LanguageModel(config, params, load_tokenizer(Path(folder)))
 
 
+def computing_in(model: LanguageModel, dtype: Dtype | None) -> LanguageModel:
+    """The same parameters, activations in another precision; as it is for None.
+
+    Parameters that are learnt stay in float32 all the same, so that small steps are not lost: mixed precision.
+    """
+    return model if dtype is None else model._replace(config=with_dtype(model.config, dtype))
+
+
+def precision(dtype: Dtype | None) -> dict[str, object]:
+    """What a run's request says of it: nothing where nothing was asked for, as runs of older versions have it."""
+    return {} if dtype is None else {"dtype": dtype}
+
+
 def load_decoder(folder: str | Path, *, dtype: Dtype | None = None) -> tuple[ModelConfig, Params]:
     """The same without a tokenizer."""
     path = Path(folder)

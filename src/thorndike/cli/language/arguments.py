@@ -1,7 +1,8 @@
 """Arguments that the verbs of language models share; nothing heavy is imported for them."""
 
 import argparse
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
 
@@ -9,10 +10,11 @@ from thorndike.cli.parser import Parser, at_least_zero, positive_whole
 from thorndike.config_fields import fields_in_source
 from thorndike.errors import UserError
 from thorndike.settings import FieldFacts, describe_kind, parse_settings
-from thorndike.startup import choose_device, prepare_large_steps
+from thorndike.startup import choose_device, cores, count_cores_as_devices, device_count, prepare_large_steps
 
 Config = TypeVar("Config")
 DEVICES = ("auto", "cpu", "gpu")
+DTYPES = ("float32", "bfloat16")
 _LARGE = 64 * 2**20
 """Bytes of parameters above which a model runs on whatever JAX finds fastest, on all processors."""
 
@@ -27,6 +29,14 @@ def add_model_argument(parser: Parser) -> None:
 def add_device_argument(parser: Parser) -> None:
     """Where it is computed."""
     parser.add_argument("--device", choices=DEVICES, default="auto", help="where it is computed (default: chosen by the model's size)")
+
+
+def add_precision_arguments(parser: Parser) -> None:
+    """In what precision it is computed, and how many devices share it."""
+    help_ = "of activations; parameters stay in float32 while they are learnt (default: the model's own)"
+    parser.add_argument("--dtype", choices=DTYPES, help=help_)
+    sharing = "how many devices (a CPU's cores) share every batch's rows (default: all accelerators; on a CPU 1)"
+    parser.add_argument("--devices", type=positive_whole, metavar="N", help=sharing)
 
 
 def add_sampling_arguments(parser: Parser, new_tokens: int) -> None:
@@ -71,15 +81,29 @@ def settings_in_words(module: str) -> str:
     return "\n".join(f"  {each.name} = {each.default}  {each.comment or describe_kind(each.kind)}" for each in facts)
 
 
-def prepare_device(device: str, model: Path | None) -> None:
-    """Choose the device by the size of a model's files. Raises ``UserError`` where there is no model, or no such device."""
+def prepare_device(device: str, model: Path | None, devices: int | None = None) -> None:
+    """Choose the device by the size of a model's files. Raises ``UserError`` where there is no model, or no such device.
+
+    A CPU then counts as ``devices``, at most as many as it has cores, with a thread each.
+    """
     large = False
     if model is not None:
         if not (model / "config.json").is_file():
             raise UserError(f"{model} is no model: it has no config.json; give a folder as transformers' save_pretrained writes it")
         large = sum(path.stat().st_size for path in model.glob("*.safetensors")) > _LARGE
     prepare_large_steps()
-    choose_device(device, large)
+    number = min(devices or 1, cores())
+    count_cores_as_devices(number)
+    choose_device(device, large, number if number > 1 else None)
+
+
+@contextmanager
+def sharing(devices: int | None) -> Iterator[None]:
+    """Let the devices that there are, at most so many, share the rows of batches."""
+    from thorndike.training.devices import sharing_rows
+
+    with sharing_rows(device_count(devices)):
+        yield
 
 
 def _whole_at_least_zero(text: str) -> int:

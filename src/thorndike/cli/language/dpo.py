@@ -5,7 +5,7 @@ from pathlib import Path
 
 from thorndike.cli.answer import Answer
 from thorndike.cli.language.aligning import add_training_arguments, lora_of
-from thorndike.cli.language.arguments import given_settings, prepare_device, settings_in_words
+from thorndike.cli.language.arguments import given_settings, prepare_device, settings_in_words, sharing
 from thorndike.cli.language.config_file import parse_with_config
 from thorndike.cli.language.report import report
 from thorndike.cli.parser import Parser
@@ -24,7 +24,11 @@ def run(words: Sequence[str]) -> Answer:
     parser.add_argument("--data", type=Path, action="append", required=True, metavar="FILE", help="rows with chosen and rejected")
     options = parse_with_config(parser, words, "dpo", "dpo")
     settings = given_settings(options.settings, "dpo")
-    prepare_device(options.device, options.model)
+    prepare_device(options.device, options.model, options.devices)
     from thorndike.language.aligning import align_by_preferences
 
-    return report(align_by_preferences(options.model, options.data, options.out, settings, lora=lora_of(options.lora), seed=options.seed))
+    with sharing(options.devices):
+        found = align_by_preferences(
+            options.model, options.data, options.out, settings, lora=lora_of(options.lora), seed=options.seed, dtype=options.dtype
+        )
+    return report(found)

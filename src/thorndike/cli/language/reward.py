@@ -5,7 +5,7 @@ from pathlib import Path
 
 from thorndike.cli.answer import Answer
 from thorndike.cli.language.aligning import add_training_arguments, lora_of, teller
-from thorndike.cli.language.arguments import given_settings, prepare_device, settings_in_words
+from thorndike.cli.language.arguments import given_settings, prepare_device, settings_in_words, sharing
 from thorndike.cli.language.config_file import parse_with_config
 from thorndike.cli.parser import Parser, positive_whole
 
@@ -28,7 +28,7 @@ def run(words: Sequence[str]) -> Answer:
     parser.add_argument("--members", type=positive_whole, default=1, metavar="N", help="models whose mean is the reward (default: 1)")
     options = parse_with_config(parser, words, "reward", "reward_model")
     settings = given_settings(options.settings, "reward_model")
-    prepare_device(options.device, options.model)
+    prepare_device(options.device, options.model, options.devices)
     from thorndike.language.aligning import train_reward_model
 
     show = teller()
@@ -37,10 +37,11 @@ def run(words: Sequence[str]) -> Answer:
         if show is not None:
             show(f"{step}: loss {metrics['train/loss'][0]:.4f}, accuracy {metrics['train/accuracy'][0]:.3f}")
 
-    found = train_reward_model(
-        options.model, options.data, options.held_out, options.out, settings, members=options.members, seed=options.seed,
-        lora=lora_of(options.lora), log=log,
-    )  # fmt: skip
+    with sharing(options.devices):
+        found = train_reward_model(
+            options.model, options.data, options.held_out, options.out, settings, members=options.members, seed=options.seed,
+            lora=lora_of(options.lora), dtype=options.dtype, log=log,
+        )  # fmt: skip
     low, high = found.accuracy_ci95
     lines = [
         f"right on {found.accuracy:.1%} [{low:.1%}, {high:.1%}] of {found.pairs} held-out pairs; "
