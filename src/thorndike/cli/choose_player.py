@@ -13,7 +13,9 @@ from thorndike.training.run_listing import all_runs, read_facts
 from thorndike.user_code import lasting_name
 
 GAME_HELP = "a game: connect_four, othello, go_9x9, chess, ...; or yours, path/to/file.py:NAME"
-PLAYER_HELP = "random, mcts, mcts:simulations=400, trained, gnugo:level=3, rhino:level=3, stockfish:elo=1500, fairy:skill=-10, or a run"
+PLAYER_HELP = (
+    "random, mcts, mcts:simulations=400, trained, gnugo:level=3, rhino:level=3, gnubg, stockfish:elo=1500, fairy:skill=-10, or a run"
+)
 
 
 def check_game(name: str, alone: bool) -> bool:

@@ -1,4 +1,4 @@
-"""GNU Backgammon: its names of positions and moves against pgx's, and the program itself where it is installed."""
+"""Backgammon: what a network sees of it, and GNU Backgammon: its names of positions and moves, and itself where it is installed."""
 
 import numpy as np
 import pytest
@@ -82,6 +82,23 @@ def test_hops_are_played_over_the_dice_of_a_throw_in_an_order_that_is_legal(rule
     assert said == names
 
 
+def test_a_network_sees_each_point_as_tesauros_did(rules):
+    seen, random = jax.jit(rules.game.observe), np.random.default_rng(3)
+    position = rules.init(0)
+    for number in range(60):
+        board, left = np.asarray(position._board), [int(die) for die in np.asarray(position._playable_dice) if die >= 0]
+        expected = []
+        for side in (1, -1):
+            for index in range(24):
+                count = max(side * int(board[index]), 0)
+                expected += [float(count == 1), float(count >= 2), float(count >= 3), max(count - 3, 0) / 2]
+        expected += [board[24] / 2, -board[25] / 2, board[26] / 15, -board[27] / 15]
+        expected += [float(die in left) for die in range(6)] + [len(left) / 4]
+        np.testing.assert_allclose(seen(position)[0, 0], expected, atol=1e-6)
+        legal = rules.legal(position)
+        position = rules.step(position, int(random.choice(legal)), 5, number)
+
+
 def test_it_is_known_where_it_can_play_and_what_can_be_set():
     for text, game_id, message in [
         ("gnubg", "chess", "plays backgammon"),
@@ -92,6 +109,7 @@ def test_it_is_known_where_it_can_play_and_what_can_be_set():
             check_engine(text, game_id)
 
 
+@pytest.mark.slow
 def test_it_plays_whole_games_by_the_rules_and_beats_random_moves(rules):
     try:
         program_of(ENGINES["gnubg"])
@@ -106,6 +124,7 @@ def test_it_plays_whole_games_by_the_rules_and_beats_random_moves(rules):
     assert [game.score for game in played] == [1.0, 0.0]
 
 
+@pytest.mark.slow
 def test_a_throw_that_somebody_else_began_is_refused_in_one_line(rules):
     try:
         program_of(ENGINES["gnubg"])
