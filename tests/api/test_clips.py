@@ -153,12 +153,12 @@ def test_films_are_kept_of_the_clips_that_are_asked(tmp_path):
 @pytest.mark.slow
 def test_500_choices_reach_four_fifths_of_what_the_true_reward_gives(tmp_path):
     """Five seeds on Pendulum-v1; returns are negative, so both readings: the gain over random actions (-1,208), and the plain ratio."""
-    told, true = [], []
+    told, true, learner = [], [], {"steps": 150_000, "settings": {"learning_rate": "linear(1e-3, 0)"}}
     for seed in range(5):
         rater = td.SimulatedRater(temperature=1.0)
-        found = td.train_on_choices("ppo", "Pendulum-v1", tmp_path / str(seed), simulated=rater, steps=200_000, seed=seed)
+        found = td.train_on_choices("ppo", "Pendulum-v1", tmp_path / str(seed), simulated=rater, seed=seed, **learner)
         told.append(td.load(found.run).evaluate(100).mean)
-        run = td.train("ppo", "Pendulum-v1", steps=200_000, seed=seed, output=tmp_path / "true")
+        run = td.train("ppo", "Pendulum-v1", seed=seed, output=tmp_path / "true", **learner)
         true.append(td.load(run.run).evaluate(100).mean)
     gains = [(mine + 1208) / (theirs + 1208) for mine, theirs in zip(told, true, strict=True)]
     assert min(gains) >= 0.8, (told, true)
