@@ -10,7 +10,7 @@ import thorndike as td
 from thorndike.api.clip_rounds import shares
 from thorndike.clips.choices import left_to_judge
 from thorndike.clips.folder import collections
-from thorndike.clips.reward_files import read_reward
+from thorndike.clips.reward_files import load_reward, read_reward
 from thorndike.training.sealed_folders import SealedFolder
 from thorndike.training.tree_files import read_arrays
 
@@ -51,7 +51,7 @@ def test_a_run_pauses_and_goes_on_with_the_reward_that_more_choices_tell(by_hand
     record = json.loads((finished.run / "run.json").read_text())
     assert record["reward"]["path"] == str(fitted.reward) and [each["step"] for each in record["rewards"]] == [100]
     assert record["rewards"][0]["path"] == str(other.reward) and record["wrappers"][0]["name"] == "learned_reward"
-    rewards = [np.asarray(read_reward(where / "rewards" / str(number)).held.params) for number in range(2)]
+    rewards = [np.asarray(load_reward(read_reward(where / "rewards" / str(number))).params) for number in range(2)]
     assert not np.array_equal(*rewards)
     # The two newest checkpoints were written after the change.
     for kept in learnt_in(finished.run):

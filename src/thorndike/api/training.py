@@ -19,13 +19,11 @@ from thorndike.api.building import (
     prepare_devices,
 )
 from thorndike.api.exporting import export_policy
-from thorndike.api.learned_rewards import as_recorded, reward_of, with_change, with_reward
+from thorndike.api.learned_rewards import as_recorded, in_front, reward_of, with_change, with_reward
 from thorndike.api.planning import plan_run
 from thorndike.api.recorded_run import Objects, rebuild, request_in
 from thorndike.api.starting import first_carry, offline_request
 from thorndike.api.training_result import Result
-from thorndike.environments.learned_reward import learned_reward
-from thorndike.environments.wrappers import build_wrapper
 from thorndike.errors import UserError
 from thorndike.learning_sources import check_source, is_dataset
 from thorndike.networks.network import NetworkBuilder
@@ -111,14 +109,13 @@ def train(
         return plan_run(choice, settings or {}, output, name, command)
     settings, started = _begun(start_from, algorithm, choice.id, dict(settings or {}))
     actors = ActorThreads(actor_threads, actor_schedule, env_restarts)
-    learnt = None
-    if reward is not None:
-        stored = reward_of(reward, choice.id)
-        own = [build_wrapper(part) for part in found.wrappers] if wrappers is None else wrappers
-        learnt, wrappers = as_recorded(stored), [learned_reward(stored.members, stored.net_arch), *own]
+    learnt = None if reward is None else reward_of(reward, choice.id)
+    if learnt is not None:
+        wrappers = in_front(learnt, wrappers, found.wrappers)
     request = full_request(
-        algorithm, choice, found, wrappers, settings, steps, num_envs, seeds, seed, checkpoint_every, actors, data, started, learnt
-    )
+        algorithm, choice, found, wrappers, settings, steps, num_envs, seeds, seed, checkpoint_every, actors, data, started,
+        None if learnt is None else as_recorded(learnt),
+    )  # fmt: skip
     if data is None:
         prepare_devices(choice, seeds, devices)
     backend = startup.choose_device(device, is_large(algorithm, choice))
