@@ -66,10 +66,15 @@ def first_change(record: Json) -> int | None:
     return cast(int, changes[0]["step"]) if changes else None
 
 
-def in_front(stored: StoredReward, given: Sequence[Wrapper] | None, preset: Sequence[dict[str, object]]) -> list[Wrapper]:
-    """The wrappers of a run on a learnt reward: it comes first, then those that are given, or the preset's."""
+def begun_with(
+    reward: str | Path | None, environment: str, given: Sequence[Wrapper] | None, preset: Sequence[dict[str, object]]
+) -> tuple[dict[str, str] | None, Sequence[Wrapper] | None]:
+    """What is recorded of the reward that a run begins with, and its wrappers: the reward's first, then those given, or the preset's."""
+    if reward is None:
+        return None, given
+    stored = reward_of(reward, environment)
     others = [build_wrapper(part) for part in preset] if given is None else given
-    return [learned_reward(stored.members, stored.net_arch), *others]
+    return as_recorded(stored), [learned_reward(stored.members, stored.net_arch), *others]
 
 
 def reward_of(where: str | Path, environment: str) -> StoredReward:
