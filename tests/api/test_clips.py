@@ -10,7 +10,7 @@ import thorndike as td
 from thorndike.api.clip_rounds import shares
 from thorndike.clips.choices import left_to_judge
 from thorndike.clips.folder import collections
-from thorndike.clips.reward_files import read_reward
+from thorndike.clips.reward_files import load_reward, read_reward
 from thorndike.training.sealed_folders import SealedFolder
 from thorndike.training.tree_files import read_arrays
 
@@ -51,7 +51,7 @@ def test_a_run_pauses_and_goes_on_with_the_reward_that_more_choices_tell(by_hand
     record = json.loads((finished.run / "run.json").read_text())
     assert record["reward"]["path"] == str(fitted.reward) and [each["step"] for each in record["rewards"]] == [100]
     assert record["rewards"][0]["path"] == str(other.reward) and record["wrappers"][0]["name"] == "learned_reward"
-    rewards = [np.asarray(read_reward(where / "rewards" / str(number)).held.params) for number in range(2)]
+    rewards = [np.asarray(load_reward(read_reward(where / "rewards" / str(number))).params) for number in range(2)]
     assert not np.array_equal(*rewards)
     # The two newest checkpoints were written after the change.
     for kept in learnt_in(finished.run):
@@ -153,12 +153,12 @@ def test_films_are_kept_of_the_clips_that_are_asked(tmp_path):
 @pytest.mark.slow
 def test_500_choices_reach_four_fifths_of_what_the_true_reward_gives(tmp_path):
     """Five seeds on Pendulum-v1; returns are negative, so both readings: the gain over random actions (-1,208), and the plain ratio."""
-    told, true = [], []
+    told, true, learner = [], [], {"steps": 150_000, "settings": {"learning_rate": "linear(1e-3, 0)"}}
     for seed in range(5):
         rater = td.SimulatedRater(temperature=1.0)
-        found = td.train_on_choices("ppo", "Pendulum-v1", tmp_path / str(seed), simulated=rater, steps=200_000, seed=seed)
+        found = td.train_on_choices("ppo", "Pendulum-v1", tmp_path / str(seed), simulated=rater, seed=seed, **learner)
         told.append(td.load(found.run).evaluate(100).mean)
-        run = td.train("ppo", "Pendulum-v1", steps=200_000, seed=seed, output=tmp_path / "true")
+        run = td.train("ppo", "Pendulum-v1", seed=seed, output=tmp_path / "true", **learner)
         true.append(td.load(run.run).evaluate(100).mean)
     gains = [(mine + 1208) / (theirs + 1208) for mine, theirs in zip(told, true, strict=True)]
     assert min(gains) >= 0.8, (told, true)

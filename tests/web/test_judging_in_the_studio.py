@@ -50,7 +50,7 @@ def test_one_click_leads_to_what_is_judged_and_one_click_back(page, studio):
     page.wait_for_url(f"{studio.root}/")
     expect(page.get_by_role("heading", name="Play")).to_be_visible()
     page.get_by_role("link", name="Judgements").click()
-    expect(page.get_by_role("cell", name="me", exact=True)).to_be_visible()
+    expect(page.get_by_role("rowheader", name="me", exact=True)).to_be_visible()
 
 
 @pytest.mark.parametrize("path", ["/label", "/label/about", "/label/static/label.js", "/preferences"])

@@ -4,15 +4,16 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
-from thorndike.api.building import DEFAULT_STEPS, check_algorithm, choose
+from thorndike import startup
+from thorndike.api.building import DEFAULT_STEPS, check_algorithm, choose, is_large, prepare_devices
 from thorndike.api.clips import LENGTH, QUESTION, collect_clips, fit_clips, judge_clips
 from thorndike.api.training import resume, runs, train
 from thorndike.api.training_result import Result
 from thorndike.clips.choices import ask, left_to_judge
 from thorndike.clips.folder import REWARDS, collections, number_of_collections, numbered
-from thorndike.clips.reward_fitting import Config
+from thorndike.clips.reward_fitting import config_of
 from thorndike.errors import UserError
 from thorndike.training.json_files import Json, as_bytes, parse_object, read_object
 from thorndike.training.run_directory import checkpoints, write_json
@@ -90,19 +91,38 @@ def train_on_choices(
     """
     check_algorithm(algorithm)
     choice, found = choose(algorithm, environment, preset, engine, env_kwargs, max_episode_steps)
-    learner: Json = {"steps": steps or found.steps or DEFAULT_STEPS, "seeds": seeds, "seed": seed, "num_envs": num_envs}
-    learner |= {
-        "settings": dict(settings or {}),
-        "preset": preset,
-        "engine": engine,
-        "device": device,
-        "max_episode_steps": max_episode_steps,
-    }
-    reward = asdict(Config(**(fit or {})))  # type: ignore[arg-type]
-    filmed = simulated is None if films is None else films
-    clips: Json = {"length": length, "question": question, "films": filmed, "seed": seed, "max_episode_steps": max_episode_steps}
+    # Before clips are recorded: that starts JAX.
+    prepare_devices(choice, seeds)
+    startup.choose_device(device, is_large(algorithm, choice))
+    learner = _Learner(
+        steps or found.steps or DEFAULT_STEPS, seeds, seed, num_envs, dict(settings or {}), preset, engine, device, max_episode_steps
+    )
+    clips = _Clips(length, question, simulated is None if films is None else films)
+    reward = asdict(config_of(fit or {}))
     asked = _Asked(algorithm, environment, Path(to), shares(choices, rounds), simulated, learner, reward, clips, dict(choice.env_kwargs))
     return _Work(asked, progress, told or _silent).go()
+
+
+class _Learner(NamedTuple):
+    """What ``train`` is asked for."""
+
+    steps: int
+    seeds: int
+    seed: int
+    num_envs: int | None
+    settings: dict[str, object]
+    preset: str | None
+    engine: str
+    device: str
+    max_episode_steps: int | None
+
+
+class _Clips(NamedTuple):
+    """What ``collect_clips`` is asked for."""
+
+    length: int
+    question: str
+    films: bool
 
 
 class _Asked(NamedTuple):
@@ -114,9 +134,9 @@ class _Asked(NamedTuple):
     parts: list[int]
     """Choices of each round."""
     simulated: SimulatedRater | None
-    learner: Json
+    learner: _Learner
     fit: Json
-    clips: Json
+    clips: _Clips
     env_kwargs: dict[str, object]
 
     @property
@@ -124,7 +144,7 @@ class _Asked(NamedTuple):
         """What must stay as it was for the same call to go on."""
         judged = None if self.simulated is None else self.simulated._asdict()
         plan: Json = {"algorithm": self.algorithm, "environment": self.environment, "choices": self.parts, "simulated": judged}
-        return plan | {"learner": self.learner, "reward": self.fit, "clips": self.clips}
+        return plan | {"learner": self.learner._asdict(), "reward": self.fit, "clips": self.clips._asdict()}
 
 
 class _Work:
@@ -132,7 +152,7 @@ class _Work:
 
     def __init__(self, asked: _Asked, progress: bool, say: Told) -> None:
         self._asked, self._progress, self._say = asked, progress, say
-        self._where, self._rounds = asked.where, len(asked.parts)
+        self._where, self._rounds, self._seed = asked.where, len(asked.parts), asked.learner.seed
         self._result: Result | None = None
         self._accuracy: float | None = None
 
@@ -150,36 +170,36 @@ class _Work:
                 return self._told("interrupted", number, 0)
         return self._told("finished", self._rounds - 1, 0)
 
-    @property
-    def _seed(self) -> int:
-        return cast(int, self._asked.learner["seed"])
-
     def _choices(self, number: int) -> int:
         """Record the clips of a round and have them judged; how many pairs wait for people."""
         where, asked = self._where, self._asked
         if number_of_collections(where) <= number:
             self._say(f"round {number + 1} of {self._rounds}: recording clips for {asked.parts[number]} choices")
-            pairs, run = asked.parts[number], _run_in(where)
-            collect_clips(asked.environment, where, pairs=pairs, run=run, env_kwargs=asked.env_kwargs, **asked.clips)  # type: ignore[arg-type]
+            collect_clips(
+                asked.environment, where, pairs=asked.parts[number], run=_run_in(where), length=asked.clips.length,
+                question=asked.clips.question, films=asked.clips.films, env_kwargs=asked.env_kwargs,
+                max_episode_steps=asked.learner.max_episode_steps, seed=self._seed,
+            )  # fmt: skip
         _keep_plan(where, asked.plan)
         if number < number_of_collections(where) - 1:
             return 0
         ask(where, collections(where)[number])
         if asked.simulated is not None:
-            judge_clips(where, **asked.simulated._asdict(), seed=self._seed + number)
+            judge_clips(where, temperature=asked.simulated.temperature, error_rate=asked.simulated.error_rate, seed=self._seed + number)
         return left_to_judge(where)
 
     def _train(self, number: int) -> bool:
         """Train to the end of a round; whether it came there."""
         asked, run, reward = self._asked, _run_in(self._where), numbered(self._where / REWARDS)[number]
-        steps = cast(int, asked.learner["steps"])
-        part = math.ceil(steps * WHILE_ASKING / self._rounds)
-        until = steps if number == self._rounds - 1 else part * (number + 1)
+        learner = asked.learner
+        part = math.ceil(learner.steps * WHILE_ASKING / self._rounds)
+        until = learner.steps if number == self._rounds - 1 else part * (number + 1)
         if run is None:
             self._result = train(
-                asked.algorithm, asked.environment, output=self._where / RUNS, name="choices", reward=reward, until=until,
-                checkpoint_every=part, env_kwargs=asked.env_kwargs, progress=self._progress,
-                **asked.learner,  # type: ignore[arg-type]
+                asked.algorithm, asked.environment, steps=learner.steps, seeds=learner.seeds, seed=learner.seed, num_envs=learner.num_envs,
+                settings=learner.settings, preset=learner.preset, engine=learner.engine, device=learner.device, output=self._where / RUNS,
+                name="choices", checkpoint_every=part, max_episode_steps=learner.max_episode_steps, env_kwargs=asked.env_kwargs,
+                reward=reward, until=until, progress=self._progress,
             )  # fmt: skip
         elif _steps_in(run) < until:
             self._result = resume(run, reward=reward, until=until, progress=self._progress)

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from thorndike import startup
 from thorndike.api.building import EnvironmentLike
 from thorndike.api.loading import LoadedPolicy, bounded, load
 from thorndike.clips import choices as judging
@@ -25,8 +26,8 @@ from thorndike.clips.folder import (
     read_about,
 )
 from thorndike.clips.queries import pairs_to_ask
-from thorndike.clips.reward_files import newest_reward, read_reward, write_reward
-from thorndike.clips.reward_fitting import Config, Report, fit_reward, predicted_returns
+from thorndike.clips.reward_files import load_reward, newest_reward, read_reward, write_reward
+from thorndike.clips.reward_fitting import Report, config_of, fit_reward, predicted_returns
 from thorndike.clips.segments import Segments
 from thorndike.environments import registry
 from thorndike.environments.host.action_masks import mask_in_observation
@@ -83,6 +84,7 @@ def collect_clips(
     where = Path(to)
     if pairs < 1 or length < 1 or not 0 <= seed < 2**32:
         raise UserError(f"record at least one pair of clips of at least one step; got pairs={pairs}, length={length}, seed={seed}")
+    startup.choose_device("auto", False)
     choice = bounded(registry.resolve(environment, env_kwargs=env_kwargs, max_episode_steps=max_episode_steps))
     loaded = None if run is None else run if isinstance(run, LoadedPolicy) else load(run)
     if loaded is not None and loaded.facts["environment"] != lasting_name(choice.id):
@@ -98,7 +100,7 @@ def collect_clips(
     dice, sums = np.random.default_rng([seed, number]), None
     if learnt is not None:
         stored = read_reward(learnt)
-        sums = predicted_returns(stored.held, found, stored.net_arch)
+        sums = predicted_returns(load_reward(stored), found, stored.net_arch)
     chosen = pairs_to_ask(found.number, pairs, dice, sums)
     used, renumbered = np.unique(chosen, return_inverse=True)
     made_by = "random actions" if loaded is None else str(loaded.run)
@@ -128,7 +130,8 @@ def judge_clips(where: str | Path, *, temperature: float = 1.0, error_rate: floa
 def fit_clips(where: str | Path, *, settings: Mapping[str, object] | None = None, seed: int = 0) -> Fitted:
     """Learn a reward from all choices in a folder; it is kept there beside those before it. Raises ``UserError`` for too few choices."""
     where = Path(where)
-    about, config = read_about(where), Config(**(settings or {}))  # type: ignore[arg-type]
+    startup.choose_device("auto", False)
+    about, config = read_about(where), config_of(settings or {})
     segments, spaces = all_segments(where), about.spaces
     held, report = fit_reward(segments, judging.read_choices(where), spaces, config, seed)
     return Fitted(write_reward(where, held, tuple(config.net_arch), about.environment, spaces, report), report)

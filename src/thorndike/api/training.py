@@ -19,13 +19,11 @@ from thorndike.api.building import (
     prepare_devices,
 )
 from thorndike.api.exporting import export_policy
-from thorndike.api.learned_rewards import as_recorded, reward_of, with_change, with_reward
+from thorndike.api.learned_rewards import begun_with, reward_of, with_change, with_reward
 from thorndike.api.planning import plan_run
 from thorndike.api.recorded_run import Objects, rebuild, request_in
 from thorndike.api.starting import first_carry, offline_request
 from thorndike.api.training_result import Result
-from thorndike.environments.learned_reward import learned_reward
-from thorndike.environments.wrappers import build_wrapper
 from thorndike.errors import UserError
 from thorndike.learning_sources import check_source, is_dataset
 from thorndike.networks.network import NetworkBuilder
@@ -92,8 +90,7 @@ def train(
     divides; that changes how long it takes and no result. ``env_timeout`` is how many seconds a step of an environment in a process of
     its own may take (60 by default), a reset twice that. ``actor_threads`` play host environments while the learner learns, each a pool of
     ``num_envs`` of its own, on the ``fixed`` schedule, which can be repeated, or the ``free`` one; ``env_restarts`` is how often a pool may
-    be made anew after a fault. ``reward`` is a folder of clips, or a reward learnt in one, that stands in place of the environment's own.
-    ``until`` pauses the run at so many of its steps; ``resume`` goes on. Raises ``UserError`` for anything that cannot be.
+    be made anew. ``reward`` is a folder of clips, or a reward learnt in one; ``until`` pauses at a step. Raises ``UserError``.
     """
     check_algorithm(algorithm)
     _check_numbers(seed, seeds, num_envs)
@@ -111,11 +108,7 @@ def train(
         return plan_run(choice, settings or {}, output, name, command)
     settings, started = _begun(start_from, algorithm, choice.id, dict(settings or {}))
     actors = ActorThreads(actor_threads, actor_schedule, env_restarts)
-    learnt = None
-    if reward is not None:
-        stored = reward_of(reward, choice.id)
-        own = [build_wrapper(part) for part in found.wrappers] if wrappers is None else wrappers
-        learnt, wrappers = as_recorded(stored), [learned_reward(stored.members, stored.net_arch), *own]
+    learnt, wrappers = begun_with(reward, choice.id, wrappers, found.wrappers)
     request = full_request(
         algorithm, choice, found, wrappers, settings, steps, num_envs, seeds, seed, checkpoint_every, actors, data, started, learnt
     )
@@ -123,12 +116,9 @@ def train(
         prepare_devices(choice, seeds, devices)
     backend = startup.choose_device(device, is_large(algorithm, choice))
     job = _until(build_job(request, choice, wrappers, network, env_timeout, devices=startup.device_count(devices)), until)
-    run = new_run_directory(output, choice.id, algorithm, name)
     objects = {"network": "user" if network else "default", "environment_object": not isinstance(environment, str)}
     record = {**facts(), "status": "running", "command": command, "device": backend, **objects, **as_json(request)}
-    with closing(job), run_lock(run):
-        _begin_record(run, record)
-        return _conduct(run, record, job, progress, lambda: Start(first_carry(job)))
+    return _from_the_start(job, new_run_directory(output, choice.id, algorithm, name), record, progress)
 
 
 def resume(
@@ -199,6 +189,12 @@ def refuse_given(arguments: Mapping[str, object], why: str) -> None:
     for name, value in arguments.items():
         if value:
             raise UserError(f"{why}: leave {name} out")
+
+
+def _from_the_start(job: Job, run: Path, record: Json, progress: bool) -> Result:
+    with closing(job), run_lock(run):
+        _begin_record(run, record)
+        return _conduct(run, record, job, progress, lambda: Start(first_carry(job)))
 
 
 def _until(job: Job, until: int | None) -> Job:

@@ -4,6 +4,7 @@
 ``choices.db`` (a preference store) and ``rewards/<n>``. What is there is never written over.
 """
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple, cast
 
@@ -88,7 +89,8 @@ def read_about(where: Path) -> About:
             f"{where} is no folder of clips: it has no {FACTS}; make one: thorndike clips collect ENVIRONMENT --to DIR"
         ) from None
     check_fields(content, _KINDS, where / FACTS)
-    return About(**{name: content[name] for name in About._fields})  # type: ignore[arg-type]
+    make: Callable[..., About] = About
+    return make(*(content[name] for name in About._fields))
 
 
 def numbered(folder: Path) -> list[Path]:

@@ -4,6 +4,7 @@ import hashlib
 from pathlib import Path
 from typing import NamedTuple, cast
 
+import gymnasium
 import jax
 
 from thorndike.clips.folder import FACTS, REWARDS, numbered
@@ -21,19 +22,15 @@ _KINDS = {"environment": TEXT, "observation_space": OBJECT, "action_space": OBJE
 
 
 class StoredReward(NamedTuple):
-    """A reward that was learnt, and where it lies."""
+    """A reward that was learnt, and where it lies; its arrays are read by ``load_reward``."""
 
     path: Path
     sha256: str
     """Of its manifest, which names the hash of every file."""
     environment: str
+    spaces: tuple[gymnasium.Space, gymnasium.Space]
+    members: int
     net_arch: tuple[int, ...]
-    held: LearnedReward
-
-    @property
-    def members(self) -> int:
-        """Networks of the ensemble."""
-        return int(self.held.params.shape[0])
 
 
 def write_reward(where: Path, held: LearnedReward, net_arch: tuple[int, ...], environment: str, spaces: tuple, report: Report) -> Path:
@@ -58,7 +55,10 @@ def newest_reward(where: Path) -> Path | None:
 
 
 def read_reward(where: str | Path) -> StoredReward:
-    """A reward, or the newest one of a folder of clips. Raises ``UserError`` if there is none, or it is not as it was written."""
+    """What is known of a reward, or of the newest one of a folder of clips; JAX is not started for it.
+
+    Raises ``UserError`` if there is none, or it is not as it was written.
+    """
     path: Path | None = Path(where)
     if (Path(where) / FACTS).exists():
         path = newest_reward(Path(where))
@@ -70,10 +70,15 @@ def read_reward(where: str | Path) -> StoredReward:
     facts = parse_object(sealed.read(_FACTS), path / _FACTS)
     check_fields(facts, _KINDS, path / _FACTS)
     with blamed_on(path / _FACTS):
-        spaces = tuple(space_from_json(cast(Json, facts[name])) for name in ("observation_space", "action_space"))
-        hidden = tuple(cast(list[int], facts["net_arch"]))
-        members = cast(int, facts["members"])
-        like = jax.eval_shape(lambda: no_reward((spaces[0], spaces[1]), members, hidden))
-    held = read_tree(like, sealed, _ARRAYS)
+        observation_space, action_space = (space_from_json(cast(Json, facts[name])) for name in ("observation_space", "action_space"))
+    hidden = tuple(cast(list[int], facts["net_arch"]))
     digest = hashlib.sha256((path / MANIFEST).read_bytes()).hexdigest()
-    return StoredReward(path.absolute(), digest, cast(str, facts["environment"]), hidden, held)
+    spaces = observation_space, action_space
+    return StoredReward(path.absolute(), digest, cast(str, facts["environment"]), spaces, cast(int, facts["members"]), hidden)
+
+
+def load_reward(stored: StoredReward) -> LearnedReward:
+    """Its arrays. Raises ``UserError`` if they are not as they were written."""
+    like = jax.eval_shape(lambda: no_reward(stored.spaces, stored.members, stored.net_arch))
+    held: LearnedReward = read_tree(like, SealedFolder(stored.path), _ARRAYS)
+    return held

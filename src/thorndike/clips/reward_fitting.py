@@ -13,6 +13,7 @@ to 1.5 times that of the others; a tenth of choices are taken to be random; what
 Logs nothing; ``Report`` says how well the choices are met.
 """
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, NamedTuple
@@ -59,6 +60,12 @@ class Config:
 
     def __post_init__(self) -> None:
         check(self)
+
+
+def config_of(settings: Mapping[str, object]) -> Config:
+    """A Config with some settings. Raises ``UserError`` for what cannot be."""
+    make: Callable[..., Config] = Config
+    return make(**settings)
 
 
 class Report(NamedTuple):
@@ -214,8 +221,8 @@ def _losses(
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Of the choices that a member learns from, and of those that it does not."""
     every = _returns(network, params, data, jnp.arange(data.valid.shape[0]))
-    first, second = every[data.first], every[data.second]
-    return tuple(choice_loss(first, second, data.p_first, weight, error_rate) for weight in (counts, (counts == 0).astype(jnp.float32)))  # type: ignore[return-value]
+    of = partial(choice_loss, every[data.first], every[data.second], data.p_first, error_rate=error_rate)
+    return of(weight=counts), of(weight=(counts == 0).astype(jnp.float32))
 
 
 def _levelled(learnt: LearnedReward, segments: Segments, config: Config) -> LearnedReward:
