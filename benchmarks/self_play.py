@@ -4,8 +4,8 @@ python benchmarks/self_play.py                  into benchmarks/results/self_pla
 
 Both play the same number of moves of the same number of games, compiled into one scan, with Gumbel's search; rates are positions in which
 somebody moved, a CPU-second of one core, the compiling left out, and medians of rounds in which each runs once. The shares of time are of
-our loop: the network alone is asked as often as the search asks it, the game alone is stepped as often as in the loop and in the search; the
-rest is the tree.
+our loop: the network alone is asked as often as the search asks it, the game alone is stepped as often as in the loop and in the search;
+the rest is the tree.
 """
 
 import argparse
