@@ -52,8 +52,9 @@ def prepare_large_steps() -> None:
     """
     if sys.platform.startswith("linux"):
         tune = getattr(ctypes.CDLL(None), "mallopt", None)
-        for option, value in _KEEP.items() if tune is not None else ():
-            tune(option, value)
+        if tune is not None:
+            for option, value in _KEEP.items():
+                tune(option, value)
     flags = os.environ.get("XLA_FLAGS", "")
     if version("jaxlib").startswith(_KNOWS_IT) and "concurrency_optimized_scheduler" not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} {_IN_ORDER}".strip()
