@@ -50,10 +50,11 @@ def prepare_large_steps() -> None:
     the system; 215 ms with the memory kept). And XLA orders its operations for many threads, so that more is alive at once than need be:
     292 MB of activations against 227, with rematerialisation 270 against 132.
     """
-    tune = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform.startswith("linux") else None
-    if tune is not None:
-        for option, value in _KEEP.items():
-            tune(option, value)
+    if sys.platform.startswith("linux"):
+        tune = getattr(ctypes.CDLL(None), "mallopt", None)
+        if tune is not None:
+            for option, value in _KEEP.items():
+                tune(option, value)
     flags = os.environ.get("XLA_FLAGS", "")
     if version("jaxlib").startswith(_KNOWS_IT) and "concurrency_optimized_scheduler" not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} {_IN_ORDER}".strip()
