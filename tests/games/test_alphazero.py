@@ -59,10 +59,10 @@ def test_every_tower_sees_where_pieces_are_and_begins_without_preference(tower: 
 def test_what_is_no_game_of_two_is_refused():
     with pytest.raises(UserError, match="learns games of two players, such as connect_four, and CartPole-v1 is none"):
         build_algorithm("alphazero", {}, td.make("CartPole-v1", 2).spec, None)
-    with pytest.raises(UserError, match="train alphazero or muzero on it"):
-        build_algorithm("ppo", {}, td.make("tic_tac_toe", 2).spec, None)
+    with pytest.raises(UserError, match="train ppo or alphazero or muzero on it"):
+        build_algorithm("a2c", {}, td.make("tic_tac_toe", 2).spec, None)
     spec = game_environment(TIC_TAC_TOE, 2).spec
-    with pytest.raises(UserError, match=r"two players without dice.*no learner here plays against itself by dice"):
+    with pytest.raises(UserError, match=r"two players without dice.*train it with ppo"):
         alphazero(Config(), spec._replace(game=TIC_TAC_TOE._replace(has_chance=True)))
 
 

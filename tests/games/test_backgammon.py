@@ -1,5 +1,6 @@
 """Backgammon: what a network sees of it, and GNU Backgammon: its names of positions and moves, and itself where it is installed."""
 
+import jax
 import numpy as np
 import pytest
 
@@ -80,6 +81,21 @@ def test_hops_are_played_over_the_dice_of_a_throw_in_an_order_that_is_legal(rule
         said.append(rules.game.action_name(position, action))
         position = rules.step(position, action, 0, number)
     assert said == names
+
+
+def test_a_hop_of_both_dice_is_not_taken_for_one_of_the_larger(rules):
+    position = begun(rules, 5, 4)
+    board = np.zeros(28, np.int32)
+    board[[19, 23, 26, 0, 27]] = 1, 2, 12, -5, -10
+    mask = np.zeros(156, bool)
+    for die in (4, 5):
+        mask[(26 - 5) * 6 + die - 1] = True
+    position = position.replace(_board=board, legal_action_mask=mask)
+    names, after = [], position
+    for number, action in enumerate(actions_of(rules.game, position, [(5, 0)])):
+        names.append(rules.game.action_name(after, action))
+        after = rules.step(after, action, 0, number)
+    assert names == ["5/1", "1/off:5"] and rules.mover(after) != rules.mover(position)
 
 
 def test_a_network_sees_each_point_as_tesauros_did(rules):

@@ -105,15 +105,18 @@ def hops_of(text: str) -> list[Hop]:
 
 
 def actions_of(game: Game, position: Position, hops: Sequence[Hop]) -> tuple[int, ...] | None:
-    """Legal actions of backgammon, one after another, that make these hops with the dice that are left; None if none do."""
+    """Legal actions of backgammon, one after another, that make these hops and leave no die that could be played; None if none do.
+
+    ``5/off`` may mean a five, or a four and then whatever bears off from the ace point: by the second, both dice are played.
+    """
     dice = [int(die) + 1 for die in np.asarray(position._playable_dice) if die >= 0]
     return _search(game, position, list(hops), dice)
 
 
 def _search(game: Game, position: Position, hops: list[Hop], dice: list[int]) -> tuple[int, ...] | None:
-    if not hops:
-        return ()
     legal = np.asarray(_compiled(game)[0](position))
+    if not hops:
+        return () if not dice or legal[0] or bool(position.terminated) else None
     for number, (start, end) in enumerate(hops):
         for die in sorted(set(dice), reverse=True):
             to, action = max(start - die, 0), (1 if start == _BAR else 26 - start) * 6 + die - 1
