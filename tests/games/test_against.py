@@ -95,6 +95,9 @@ def test_a_game_is_chosen_by_id_by_name_and_as_it_is():
     assert (built.spec.id, built.spec.num_envs, built.spec.game) == ("tic_tac_toe", 3, TIC_TAC_TOE)
     assert isinstance(registry.reference(given), AgainstOpponent)
     assert registry.game_of(registry.resolve("CartPole-v1")) is None
+    for named_or_given in ("connect_four", TIC_TAC_TOE):
+        with pytest.raises(UserError, match="ends by its rules: leave max_episode_steps out"):
+            registry.resolve(named_or_given, max_episode_steps=5)
     with pytest.raises(UserError, match="is a game, which is compiled"):
         registry.resolve("connect_four", engine="gymnasium")
     with pytest.raises(UserError, match="thorndike play connect_four"):

@@ -25,8 +25,10 @@ class GameSettings(NamedTuple):
     """Games against the opponent begin with 0 to so many random moves, so that no two are alike."""
 
 
-def game_settings(id: str, given: Mapping[str, object]) -> GameSettings:
-    """Settings from an environment's keyword arguments. Raises ``UserError`` for unknown ones, and values that cannot be."""
+def game_settings(id: str, given: Mapping[str, object], max_episode_steps: int | None = None) -> GameSettings:
+    """Settings from an environment's keyword arguments. Raises ``UserError`` for unknown ones, values that cannot be, and a time limit."""
+    if max_episode_steps is not None:
+        raise UserError(f"{id} is a game, which ends by its rules: leave max_episode_steps out")
     for name in given:
         if name not in GameSettings._fields:
             raise UserError(f"{id} has no setting {name!r}{did_you_mean(name, GameSettings._fields)}")
