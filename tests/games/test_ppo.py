@@ -10,7 +10,7 @@ import thorndike as td
 from games.taking import BEADS, TAKING
 from thorndike.algorithms import ppo
 from thorndike.api.building import build_algorithm
-from thorndike.environments.wrappers import chain, normalize_observation
+from thorndike.environments.wrappers import chain, frame_stack, normalize_observation
 from thorndike.errors import UserError
 from thorndike.games.against import AgainstOpponent
 from thorndike.games.environment import game_environment, observed_position
@@ -90,6 +90,11 @@ def test_a_wrapper_that_hides_the_position_is_refused_in_one_line():
     spec = game_environment(TIC_TAC_TOE, 4).spec
     with pytest.raises(UserError, match="a wrapper hides"):
         ppo.ppo(ppo.Config(), spec._replace(observation_space=spaces.Box(0, 1, (9,))))
+    for learner in ("muzero", "alphazero"):
+        with pytest.raises(UserError, match="a wrapper hides or changes"):
+            build_algorithm(learner, {}, frame_stack(2).spec(spec), None)
+    with pytest.raises(UserError, match="a wrapper hides or changes"):
+        game_of_two(frame_stack(2).spec(spec))
     assert game_of_two(normalize_observation().spec(spec)) is TIC_TAC_TOE
     assert game_of_two(spec._replace(game=TIC_TAC_TOE._replace(num_players=1))) is None
 

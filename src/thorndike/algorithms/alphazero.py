@@ -33,6 +33,7 @@ from thorndike.functional.descent import Averaged, clipped_adamw, descend_averag
 from thorndike.functional.learning_dynamics import mean_square_gradient
 from thorndike.functional.policy_losses import weighted_mean
 from thorndike.functional.schedules import schedule
+from thorndike.games.environment import check_observations
 from thorndike.games.game import Game, Position
 from thorndike.games.packing import Packing, packing
 from thorndike.games.search import SEARCHES, Evaluate, Found, SearchSettings, search
@@ -197,6 +198,7 @@ def alphazero(config: Config, spec: EnvSpec) -> Algorithm:
     game = spec.game
     if game is None or game.num_players != 2 or game.has_chance:
         raise UserError(f"alphazero plays games of two players without dice (connect_four, ...), which {spec.id} is not: train it with ppo")
+    check_observations(spec, game)
     network = board_network(game.num_actions, config.tower, config.width, config.blocks)
     optimizer = clipped_adamw(config.max_grad_norm, config.weight_decay)
     parts = Parts(config, game, network, packing(game), optimizer, spec.num_envs)

@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from jaxtyping import Array, Bool, PyTree
 
-from thorndike.games.environment import BOARD
+from thorndike.games.environment import BOARD, check_observations
 from thorndike.games.game import Game
 from thorndike.networks.masking import MASK, allowed, check_mask, has_mask
 from thorndike.replay.unrolled import Unrolled
@@ -36,11 +36,12 @@ class View(NamedTuple):
 def view_of(spec: EnvSpec, actions: int, symmetries: bool = True) -> View:
     """The view of an environment; ``symmetries``: of a game, its board turned and mirrored too.
 
-    Raises ``UserError`` if its mask does not fit the actions.
+    Raises ``UserError`` if its mask does not fit the actions, and for a game whose observations a wrapper changed.
     """
     space, turn = spec.observation_space, _as_it_is
     see: Callable[[Observation], Observation] = _as_it_is
     if spec.game is not None:
+        check_observations(spec, spec.game)
         size = int(np.prod(spec.game.observation_shape))
         space = spaces.Dict({BOARD: spaces.Box(-np.inf, np.inf, (size,), np.float32), MASK: spaces.MultiBinary(actions)})
         see = _board_and_mask

@@ -40,6 +40,13 @@ def observes_game(space: gymnasium.Space) -> bool:
     return isinstance(space, spaces.Dict) and set(space.spaces) == {BOARD, MASK, POSITION}
 
 
+def check_observations(spec: EnvSpec, game: Game) -> None:
+    """Raises ``UserError`` if a wrapper hides what a game is learnt from, or gives it another shape."""
+    given = getattr(spec.observation_space, "spaces", {})
+    if any(name not in given or given[name].shape != space.shape for name, space in observation_space(game).spaces.items()):
+        raise UserError(f"{spec.id} is learnt from its positions, which a wrapper hides or changes: leave the wrapper out")
+
+
 def observed_position(game: Game, position: Position) -> Observation:
     """One position as an observation."""
     return {

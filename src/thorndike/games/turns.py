@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PyTree
 
-from thorndike.errors import UserError
+from thorndike.games.environment import check_observations
 from thorndike.games.game import Game
 from thorndike.games.packing import packing
 from thorndike.networks.masking import POSITION
@@ -18,12 +18,11 @@ def players(game: Game, positions: PyTree) -> Int[Array, "T B"]:
 
 
 def game_of_two(spec: EnvSpec) -> Game | None:
-    """The rules, where the environment is a game of two. Raises ``UserError`` if a wrapper hides whose turn it is."""
+    """The rules, where the environment is a game of two. Raises ``UserError`` if a wrapper hides or changes them."""
     game = spec.game
     if game is None or game.num_players != 2:
         return None
-    if POSITION not in getattr(spec.observation_space, "spaces", {}):
-        raise UserError(f"{spec.id} is learnt from its positions, which a wrapper hides: leave the wrapper out")
+    check_observations(spec, game)
     return game
 
 
