@@ -43,12 +43,15 @@ def answer(capsys: pytest.CaptureFixture[str], *words: str) -> dict:
     return json.loads(told.out)
 
 
+def reward_words(folder: Path) -> list[str]:
+    words = ["reward", str(folder / "base"), "--data", str(folder / "preferences.jsonl"), "--out", str(folder / "reward"), "--members", "2"]
+    return [*words, "--set=pool=mean", "--set=batch_size=8", "--set=total_steps=40", "--set=learning_rate=0.01"]
+
+
 @pytest.fixture(scope="module")
 def reward(folder: Path) -> Path:
     """A reward model made by the command."""
-    words = ["--data", str(folder / "preferences.jsonl"), "--out", str(folder / "reward"), "--members", "2"]
-    settings = ["--set=pool=mean", "--set=batch_size=8", "--set=total_steps=40", "--set=learning_rate=0.01"]
-    assert main(["language", "reward", str(folder / "base"), *words, *settings]) == 0
+    assert main(["language", *reward_words(folder)]) == 0
     return folder / "reward" / "model"
 
 
@@ -158,7 +161,9 @@ def test_mistakes_are_one_line(folder: Path, reward: Path, capsys: pytest.Captur
         (["dpo", base, "--data", str(tmp_path / "odd.jsonl"), "--out", str(tmp_path / "y")], "odd.jsonl, row 1: p_chosen is 2"),
         (["reward", base, "--data", prompts, "--out", str(tmp_path / "y")], "expected a preference"),
         (["eval", str(reward), "--base", base, "--prompts", prompts, "--reward", str(reward)], "not of the shape"),
-        (["ask", "--db", str(folder / "p.db"), "--reward", str(reward)], "no project 'default'"),
+        (["ask", "--db", str(folder / "p.db"), "--reward", str(reward)], "there is no store"),
+        (["eval", base, "--base", base, "--prompts", prompts, "--reward", str(reward), "--temperature", "0"], "above 0"),
+        ([*reward_words(folder), "--lora", "2"], "begun with another lora"),
         (["demo", "--out", str(tmp_path / "z"), "--learners", "pppo"], "did you mean 'ppo'"),
     ]
     for words, expected in cases:

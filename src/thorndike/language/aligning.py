@@ -99,8 +99,8 @@ def train_reward_model(
     size = min(int(cast(int, settings.get("batch_size", 32))), max(1, len(train.valid)))
     config = configured(RewardConfig, {"total_steps": max(1, len(train.valid) // size), **settings, "batch_size": size})
     request = {"verb": "reward", "model": str(folder.absolute()), "data": [str(path.absolute()) for path in data], "members": members}
-    request |= precision(dtype)
-    open_run(out, request | {"held_out": [str(path.absolute()) for path in held_out], "seed": seed, "settings": settings_of(config)})
+    request |= {"held_out": [str(path.absolute()) for path in held_out], "seed": seed, "settings": settings_of(config)}
+    open_run(out, request | precision(dtype) | ({} if lora is None else {"lora": settings_of(lora)}))
     if (out / MODEL).exists():
         return cast(HeldOut, load_reward_model(out / MODEL).held_out)
     learnt = fit(reward_model(config, base.config, lora), config, base.params, train, members=members, seed=seed, log=log)
