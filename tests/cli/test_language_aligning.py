@@ -1,6 +1,7 @@
 """The verbs that learn from preferences and rewards: what they answer, what they leave behind, mistakes in one line."""
 
 import json
+import signal
 from pathlib import Path
 
 import jax
@@ -8,12 +9,14 @@ import numpy as np
 import pytest
 
 from thorndike.cli.main import main
+from thorndike.language import aligning
 from thorndike.language.decoder import initial_params
 from thorndike.language.model import LanguageModel, load_model, save_model
 from thorndike.language.preferences.assignment import Plan, next_assignments
 from thorndike.language.preferences.store import Store
 from thorndike.language.pretraining import Config, small_llama, train_tokenizer
 from thorndike.language.reward_files import load_reward_model
+from thorndike.language.reward_training import passes
 
 pytestmark = pytest.mark.usefixtures("quick_compile")
 SMALL = ["--set=episodes=8", "--set=batch_size=4", "--set=max_new_tokens=4", "--set=max_prompt_length=12", "--set=total_steps=2"]
@@ -60,6 +63,25 @@ def test_a_reward_model_says_how_good_it_is(folder: Path, reward: Path) -> None:
     assert len(model.members) == 2 and model.held_out is not None
     assert told["pairs"] == model.held_out.pairs == 8 and told["accuracy"] == model.held_out.accuracy > 0.9
     assert model.pool == "mean" and model.deviation > 0
+
+
+def test_an_interrupted_reward_model_goes_on_bit_for_bit(
+    folder: Path, reward: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = [str(tmp_path) if word == str(folder / "reward") else word for word in reward_words(folder)]
+
+    def stopping(*given):
+        batch = passes(*given)
+        return lambda step, state: signal.raise_signal(signal.SIGINT) or batch(step, state) if step == 20 else batch(step, state)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(aligning, "passes", stopping)
+        assert main(["language", *words]) == 130 and "goes on from here" in capsys.readouterr().out
+    assert not (tmp_path / "model").exists() and (tmp_path / "checkpoints" / "21").is_dir()
+    assert answer(capsys, *words)["status"] == "finished"
+    for name in ("model.safetensors", "member-1/model.safetensors", "reward.json"):
+        assert (tmp_path / "model" / name).read_bytes() == (reward / name).read_bytes()
+    assert len((tmp_path / "metrics.jsonl").read_text().splitlines()) == 40 and list(tmp_path.glob("events.out.tfevents.*"))
 
 
 @pytest.mark.parametrize("verb", ["ppo", "rloo"])
