@@ -10,13 +10,14 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PYGAME_HIDE_SUPPORT_PROMPT := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo browser test test-slow opponents bench format clean
+.PHONY: help install demo browser test test-slow opponents trl bench format clean
 
 help:
 	@echo "make demo       train PPO on CartPole-v1 with 8 seeds, evaluate, plot and film it"
 	@echo "make test       linter, formatter check, type checker, tests"
 	@echo "make test-slow  the learning tests that take long"
 	@echo "make opponents  install what agents are measured against into .venv-opponents"
+	@echo "make trl        install what language models are measured beside into .venv-trl"
 	@echo "make bench      measure against other libraries, write docs/performance.md"
 	@echo "make format     format the code and mend what the linter can"
 	@echo "make clean      remove .venv, caches and build files (runs/ stays)"
@@ -79,6 +80,17 @@ opponents: .venv-opponents/.installed
 .venv-opponents/.installed: benchmarks/opponents.txt
 	$(PYTHON) -m venv .venv-opponents
 	.venv-opponents/bin/python -m pip install --quiet -r benchmarks/opponents.txt
+	@touch $@
+
+# TRL, transformers, peft; and beside it the last TRL that had PPO.
+trl: .venv-trl/.installed
+
+.venv-trl/.installed: benchmarks/trl.txt
+	$(PYTHON) -m venv .venv-trl
+	.venv-trl/bin/python -m pip install --quiet torch==2.13.0+cpu || .venv-trl/bin/python -m pip install --quiet torch==2.13.0
+	grep -v '^torch==' benchmarks/trl.txt > .venv-trl/trl.txt
+	.venv-trl/bin/python -m pip install --quiet -r .venv-trl/trl.txt
+	.venv-trl/bin/python -m pip install --quiet --no-deps --target .venv-trl/trl-1.12.0 trl==1.12.0
 	@touch $@
 
 bench: $(STAMP) .venv-peers/.installed

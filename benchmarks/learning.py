@@ -56,6 +56,7 @@ BARS = (
     Bar("qr_dqn", "Acrobot-v1", "mean", -78),
     Bar("rainbow", "CartPole-v1", "iqm", 490),
     Bar("pqn", "CartPole-v1", "iqm", 490),
+    Bar("muzero", "CartPole-v1", "mean", 475),
     Bar("q_learning", "FrozenLake-v1", "mean", 0.70, episodes=1000),
     Bar("q_learning", "Taxi-v4", "mean", 7.8, episodes=1000),
     Bar("q_learning", "CliffWalking-v1", "mean", -13, worst=-13),

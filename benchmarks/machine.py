@@ -6,7 +6,21 @@ import platform
 import subprocess
 from pathlib import Path
 
-PACKAGES = ("jax", "jaxlib", "flax", "optax", "gymnasium", "numpy", "torch", "stable_baselines3", "sbx_rl", "rejax", "gymnax")
+PACKAGES = (
+    "jax",
+    "jaxlib",
+    "flax",
+    "optax",
+    "gymnasium",
+    "numpy",
+    "torch",
+    "stable_baselines3",
+    "sbx_rl",
+    "rejax",
+    "gymnax",
+    "transformers",
+    "trl",
+)
 
 
 def processor() -> str:

@@ -3,15 +3,17 @@
 python benchmarks/self_play.py                  into benchmarks/results/self_play.json; --simulations, --games, --tower, --width, --blocks
 
 Both play the same number of moves of the same number of games, compiled into one scan, with Gumbel's search; rates are positions in which
-somebody moved, a CPU-second of one core, the compiling left out. The shares of time are of our loop: the network alone is asked as often as
-the search asks it, the game alone is stepped as often as in the loop and in the search; the rest is the tree.
+somebody moved, a CPU-second of one core, the compiling left out, and medians of rounds in which each runs once. The shares of time are of
+our loop: the network alone is asked as often as the search asks it, the game alone is stepped as often as in the loop and in the search;
+the rest is the tree.
 """
 
 import argparse
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from statistics import median
 
 import jax
 import jax.numpy as jnp
@@ -24,18 +26,19 @@ from thorndike.games.environment import game_environment
 from thorndike.networks.board import board_network, win_value
 
 RESULT = Path(__file__).parents[1] / "benchmarks" / "results" / "self_play.json"
-ROUNDS = 3
 
 
-def cpu_seconds(run: Callable[[jax.Array], jax.Array]) -> float:
-    """The least of a few runs, after one that compiles."""
-    jax.block_until_ready(run(jax.random.key(0)))
-    times = []
-    for number in range(ROUNDS):
-        began = time.process_time()
-        jax.block_until_ready(run(jax.random.key(number)))
-        times.append(time.process_time() - began)
-    return min(times)
+def cpu_seconds(runs: Mapping[str, Callable[[jax.Array], jax.Array]], rounds: int) -> dict[str, list[float]]:
+    """Of each, a number a round; in a round all run one after the other, so that what slows the machine slows them all. Compiled before."""
+    for run in runs.values():
+        jax.block_until_ready(run(jax.random.key(0)))
+    times: dict[str, list[float]] = {name: [] for name in runs}
+    for number in range(rounds):
+        for name, run in runs.items():
+            began = time.process_time()
+            jax.block_until_ready(run(jax.random.key(number)))
+            times[name].append(time.process_time() - began)
+    return times
 
 
 def ours(config: Config, games: int, moves: int) -> Callable[[jax.Array], jax.Array]:
@@ -150,18 +153,26 @@ def main() -> None:
     parser.add_argument("--tower", default="mlp")
     parser.add_argument("--width", type=int, default=256)
     parser.add_argument("--blocks", type=int, default=2)
+    parser.add_argument("--rounds", type=int, default=5)
     options = parser.parse_args()
     config = Config(num_simulations=options.simulations, tower=options.tower, width=options.width, blocks=options.blocks)
     positions, asked = options.games * options.moves, options.moves * (options.simulations + 1)
-    spent = {
-        "ours": cpu_seconds(ours(config, options.games, options.moves)),
-        "pgx and mctx": cpu_seconds(plain(config, options.games, options.moves)),
-        "network": cpu_seconds(network_alone(config, options.games, asked)),
-        "game": cpu_seconds(game_alone(options.games, asked)),
+    runs = {
+        "ours": ours(config, options.games, options.moves),
+        "pgx and mctx": plain(config, options.games, options.moves),
+        "network": network_alone(config, options.games, asked),
+        "game": game_alone(options.games, asked),
     }
-    rates = {name: round(positions / spent[name]) for name in ("ours", "pgx and mctx")}
-    shares = {name: round(spent[name] / spent["ours"], 3) for name in ("network", "game")}
-    row = {**vars(options), "positions_per_cpu_s": rates, "shares": {**shares, "tree": round(1 - sum(shares.values()), 3)}}
+    spent = cpu_seconds(runs, options.rounds)
+    rates = {name: [round(positions / seconds) for seconds in spent[name]] for name in ("ours", "pgx and mctx")}
+    ratios = [round(theirs / own, 3) for own, theirs in zip(spent["ours"], spent["pgx and mctx"], strict=True)]
+    shares = {name: round(median(spent[name]) / median(spent["ours"]), 3) for name in ("network", "game")}
+    row = {
+        **vars(options),
+        "positions_per_cpu_s": {name: median(values) for name, values in rates.items()},
+        "rounds_positions_per_cpu_s": rates,
+    }
+    row |= {"ratio": median(ratios), "ratios": ratios, "shares": {**shares, "tree": round(1 - sum(shares.values()), 3)}}
     results = json.loads(RESULT.read_text(encoding="utf-8")) if RESULT.exists() else {}
     results[f"{options.tower} {options.width} x {options.blocks}, {options.simulations} simulations, {options.games} games"] = row
     RESULT.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")

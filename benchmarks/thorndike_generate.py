@@ -13,6 +13,7 @@ from thorndike import startup
 if __name__ == "__main__":
     # What is set here is read when JAX is imported.
     startup.prepare()
+    startup.prepare_large_steps()
     import jax
 
     from thorndike.language.generation import generate

@@ -181,7 +181,7 @@ POLICY = ["ppo", "trpo", "a2c", "a3c", "impala", "reinforce"]
 VALUE = ["dqn", "rainbow", "qr_dqn", "iqn", "pqn", "bootstrapped_dqn"]
 CONTROL = ["sac", "td3", "ddpg", "tqc", "crossq", "redq"]
 FROM_DATA = ["bc", "cql", "iql", "td3_bc", "awac"]
-GAMES = ["alphazero"]
+GAMES = ["alphazero", "muzero"]
 
 
 @pytest.mark.parametrize("algorithm", [*POLICY, *VALUE, *CONTROL, *FROM_DATA, *GAMES])

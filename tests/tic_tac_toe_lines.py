@@ -2,12 +2,17 @@
 
 from collections.abc import Callable
 from functools import cache
+from pathlib import Path
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from thorndike.games.tic_tac_toe import TicTacToePosition
+import thorndike as td
+from thorndike.api.building import build_algorithm
+from thorndike.games.environment import observed_position
+from thorndike.games.tic_tac_toe import TIC_TAC_TOE, TicTacToePosition
 
 SIDE_BY_SIDE = 64
 """Positions that are decided together."""
@@ -99,6 +104,16 @@ def walk(choose: Choose, agent: int) -> Lines:
                     found[ended if agent == 0 else -ended] += count
         level = following
     return Lines(found[1], found[0], found[-1])
+
+
+def chooser(run: Path, simulations: int) -> Choose:
+    """The policy of a run of alphazero or muzero, with that many simulations a move."""
+    loaded = td.load(run)
+    policy, facts = loaded.policy, loaded.facts
+    algorithm = build_algorithm(facts["algorithm"], {**facts["config"], "eval_simulations": simulations}, policy.spec, None)
+    actor, noise = jax.tree.map(lambda leaf: leaf[0], policy.actors), policy.noise(jax.random.key(0), SIDE_BY_SIDE)
+    see = jax.vmap(lambda position: observed_position(TIC_TAC_TOE, position))
+    return jax.jit(lambda positions: algorithm.greedy(actor, algorithm.memory(SIDE_BY_SIDE), see(positions), noise)[1])
 
 
 def optimal_share(choose: Choose) -> float:

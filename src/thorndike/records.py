@@ -55,11 +55,11 @@ _OF_RUN: Mapping[str, Kind] = {
     "device": TEXT,
     "processors": TEXT,
 }
-_DATASET = Kind(
-    "the path and the sha256 of a dataset",
+_LEARNT_FROM = Kind(
+    "a path and a sha256",
     lambda value: isinstance(value, dict) and set(value) == {"path", "sha256"} and all(map(TEXT.admits, value.values())),
 )
-_OF_OFFLINE: Mapping[str, Kind] = {"dataset": optional(_DATASET), "start_from": optional(TEXT)}
+_OF_LATER: Mapping[str, Kind] = {"dataset": optional(_LEARNT_FROM), "start_from": optional(TEXT), "reward": optional(_LEARNT_FROM)}
 _OF_POLICY: Mapping[str, Kind] = {**_SHARED, "observation_space": OBJECT, "action_space": OBJECT, "best": whole(0, _MOST)}
 
 
@@ -72,7 +72,7 @@ def read_record(run: Path) -> Json:
     check_fields(record, _OF_RUN, where)
     # Runs of older versions do not have it.
     check_fields({"actors": record.get("actors")}, {"actors": optional(OBJECT)}, where)
-    check_fields({name: record.get(name) for name in _OF_OFFLINE}, _OF_OFFLINE, where)
+    check_fields({name: record.get(name) for name in _OF_LATER}, _OF_LATER, where)
     _check_learner(record, where)
     return record
 

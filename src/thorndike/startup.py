@@ -1,13 +1,22 @@
-"""What must be decided before JAX starts: processors, XLA's options, the compilation cache, the device."""
+"""What must be decided before JAX starts: processors, XLA's options, the compilation cache, the device, how memory is kept."""
 
+import ctypes
 import os
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 from thorndike.errors import UserError
 
 _SMALL_LOOPS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=65536"
 """Lets XLA turn a loop over a table into one function: measured 10x faster tabular learning. It changes nothing elsewhere."""
+
+_KEEP = {-8: 1, -4: 0, -1: 2**31 - 1}
+"""glibc's ``mallopt``: one arena, no block mapped on its own, nothing handed back to the system at the end of the heap."""
+
+_IN_ORDER = "--xla_cpu_enable_concurrency_optimized_scheduler=false"
+_KNOWS_IT = "0.10."
+"""The jaxlib that was tried with this option: XLA ends the process over one that it does not know."""
 
 _AS_DEVICES = "--xla_force_host_platform_device_count="
 
@@ -31,6 +40,24 @@ def prepare() -> None:
     # Headless drawing of Gymnasium's classic environments.
     if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+
+
+def prepare_large_steps() -> None:
+    """Make what a language model's steps need of memory cheap, and little; before JAX starts.
+
+    A step asks for hundreds of megabytes at once and frees them. By default glibc maps each such block anew, and the system clears it page
+    by page: a third of the CPU time (measured with a million parameters and 4,096 tokens, forward and backward: 363 ms, of which 117 in
+    the system; 215 ms with the memory kept). And XLA orders its operations for many threads, so that more is alive at once than need be:
+    292 MB of activations against 227, with rematerialisation 270 against 132.
+    """
+    if sys.platform.startswith("linux"):
+        tune = getattr(ctypes.CDLL(None), "mallopt", None)
+        if tune is not None:
+            for option, value in _KEEP.items():
+                tune(option, value)
+    flags = os.environ.get("XLA_FLAGS", "")
+    if version("jaxlib").startswith(_KNOWS_IT) and "concurrency_optimized_scheduler" not in flags:
+        os.environ["XLA_FLAGS"] = f"{flags} {_IN_ORDER}".strip()
 
 
 def cores() -> int:

@@ -99,9 +99,6 @@ class EnvSpec(NamedTuple):
     max_episode_steps: int | None = None
     engine: str = "native"
     """``native`` (compiled), ``gymnasium``, ``subprocess``, ``envpool`` or ``ale``; ``dataset`` where nothing is stepped."""
-    num_agents: int = 1
-    can_vmap: bool = True
-    can_restore: bool = True
     goal: Goal | None = None
     """For hindsight; None where there are no goals, or where no compiled program can judge them."""
     frames: int = 1

@@ -24,6 +24,7 @@ from thorndike.algorithms import (
     impala,
     iql,
     iqn,
+    muzero,
     ppo,
     pqn,
     q_learning,
@@ -132,6 +133,23 @@ ALPHAZERO = alphazero.Config(
     blocks=1,
     learning_rate="linear(1e-3, 0)",
 )
+MUZERO = muzero.Config(
+    total_steps=1000,
+    buffer_size=120,
+    learning_starts=40,
+    batch_size=8,
+    train_freq=8,
+    gradient_steps=2,
+    unroll_steps=2,
+    n_step=3,
+    num_simulations=3,
+    eval_simulations=2,
+    atoms=11,
+    net_arch=(8,),
+    state_size=6,
+    width=8,
+    learning_rate="linear(1e-3, 0)",
+)
 TRPO = trpo.Config(total_steps=1000, n_steps=8, batch_size=16, n_critic_updates=2, net_arch=(8,), cg_max_steps=4)
 BINS = (wrappers.discretise(6),)
 RUN = {
@@ -155,6 +173,7 @@ RUN = {
     "ppo, bonuses": Case(ppo.ppo, PPO, "CartPole-v1", NEW),
     "q_learning": Case(q_learning.q_learning, parts(TABLE, variant="sarsa"), "MountainCar-v0", BINS),
     "alphazero": GameCase(alphazero.alphazero, parts(ALPHAZERO, resign_threshold=-0.1), "tic_tac_toe"),
+    "muzero": Case(muzero.muzero, MUZERO, "CartPole-v1"),
     "iql": DataCase(iql.iql, iql.Config(**DATA, learning_rate="linear(1e-3, 0)"), DISCRETE),
     "td3_bc": DataCase(td3_bc.td3_bc, td3_bc.Config(**DATA), BOX),
     "cql, Box": DataCase(cql.cql, cql.Config(**DATA, n_actions=2), BOX),
@@ -167,6 +186,8 @@ ALL = RUN | {
     "ppo, Box, beta": Case(ppo.ppo, parts(PPO, action_distribution="beta"), "Pendulum-v1"),
     "alphazero, puct": GameCase(alphazero.alphazero, parts(ALPHAZERO, search="puct", tower="patches"), "connect_four"),
     "alphazero, conv": GameCase(alphazero.alphazero, parts(ALPHAZERO, tower="conv", full_search_fraction=1.0), "connect_four"),
+    "muzero, a game, puct": GameCase(muzero.muzero, parts(MUZERO, search="puct"), "tic_tac_toe"),
+    "muzero, images, as played": Case(muzero.muzero, parts(MUZERO, bootstrap="search", eval_simulations=0), "MinAtar/Breakout-v1"),
     "bc": DataCase(bc.bc, bc.Config(**DATA), DISCRETE),
     "bc, Box": DataCase(bc.bc, bc.Config(**DATA), BOX),
     "iql, Box": DataCase(iql.iql, iql.Config(**DATA), BOX),
@@ -281,7 +302,20 @@ class Bound(NamedTuple):
     traces: list[str]
 
 
-SLOW = ("ppo, bonuses", "dqn, hindsight", "td3", "crossq", "dqn, lstm", "a2c, gru", "a3c, gru", "trpo", "pqn", "td3_bc", "cql, Box")
+SLOW = (
+    "ppo, bonuses",
+    "dqn, hindsight",
+    "td3",
+    "crossq",
+    "dqn, lstm",
+    "a2c, gru",
+    "a3c, gru",
+    "trpo",
+    "pqn",
+    "td3_bc",
+    "cql, Box",
+    "muzero",
+)
 """Cases whose machinery another one runs too."""
 
 

@@ -26,6 +26,7 @@ from thorndike.algorithms import (
     impala,
     iql,
     iqn,
+    muzero,
     ppo,
     pqn,
     q_learning,
@@ -104,7 +105,9 @@ class Learnt(NamedTuple):
         """``[seeds, samples, observations]`` as the policy draws them; of one that explores by epsilon, without that."""
 
         def chosen(actor, seen):
-            noise = jax.tree.map(lambda leaf: leaf[:, : seen.shape[0]], self.algorithm.draw(jax.random.key(7), SAMPLES))
+            drawn = self.algorithm.draw(jax.random.key(7), SAMPLES)
+            # One key a step is for all environments.
+            noise = jax.tree.map(lambda leaf: leaf if leaf.ndim == 1 else leaf[:, : seen.shape[0]], drawn)
             choose = self.algorithm.greedy if hasattr(actor, "epsilon") else self.algorithm.act
             return jax.vmap(lambda drawn: choose(actor, self.algorithm.memory(seen.shape[0]), seen, drawn)[1])(noise)
 
@@ -244,6 +247,31 @@ def dqn_for(iterations: int, spec: EnvSpec, learner=dqn, **parts) -> Algorithm:
     return getattr(learner, name)(learner.Config(**(config | parts)), spec)
 
 
+def muzero_for(iterations: int, spec: EnvSpec, **settings) -> Algorithm:
+    config = muzero.Config(
+        total_steps=iterations * NUM_ENVS,
+        learning_rate="linear(0.005, 0)",
+        buffer_size=4000,
+        learning_starts=200,
+        train_freq=NUM_ENVS,
+        gradient_steps=2,
+        batch_size=32,
+        gamma=GAMMA,
+        unroll_steps=2,
+        n_step=3,
+        num_simulations=4,
+        temperature="linear(1, 0.1)",
+        value_limit=12.0,
+        atoms=25,
+        averaging=0.02,
+        net_arch=(16,),
+        state_size=12,
+        width=16,
+        **settings,
+    )
+    return muzero.muzero(config, spec)
+
+
 def bootstrapped_for(iterations: int, spec: EnvSpec) -> Algorithm:
     config = bootstrapped_dqn.Config(
         total_steps=iterations * NUM_ENVS,
@@ -350,6 +378,7 @@ SLOW_CASES = {
     "dqn, reset": lambda: learn(DISCRETE, partial(dqn_for, 2400, reset_every=801 * NUM_ENVS), 2400),
     "qr_dqn": lambda: learn(DISCRETE, partial(dqn_for, 1200, learner=qr_dqn, n_quantiles=8), 1200),
     "iqn": lambda: learn(DISCRETE, partial(dqn_for, 1600, learner=iqn, n_quantiles=8, net_arch=(32, 32)), 1600),
+    "muzero": lambda: learn(DISCRETE, partial(muzero_for, 1200), 1200),
     # Expectiles near 1 and little conservatism: the values are then those of the best policy.
     "iql": lambda: learn_from_data(DISCRETE, partial(offline_for, 2000, iql, expectile=0.99, temperature=0.1), 2000),
     "iql, Box": lambda: learn_from_data(BOX, partial(offline_for, 4000, iql, expectile=0.99, temperature=0.02), 4000),

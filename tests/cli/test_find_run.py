@@ -4,10 +4,11 @@ import json
 
 import pytest
 
-from thorndike.cli.find_run import all_runs, find_run
+from thorndike.cli.find_run import find_run
 from thorndike.cli.main import main
 from thorndike.cli.show import last_evaluation
 from thorndike.errors import UserError
+from thorndike.training.run_listing import all_runs
 
 
 @pytest.fixture

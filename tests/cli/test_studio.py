@@ -62,3 +62,18 @@ def test_it_says_where_it_is_and_ends_in_order(number, status, word, tmp_path):
     out, err = process.communicate(timeout=20)
     assert (process.returncode, out, err) == (status, "", f"Ctrl-C ends it.\nthorndike: {word}\n")
     assert not list(tmp_path.iterdir()), "nothing is left in the folder it was started in"
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (["--label", "nothing.db"], "--label nothing.db: there is no preference store"),
+        (["--media", "films"], "--project and --media say what is judged: give --label STORE"),
+    ],
+)
+def test_a_store_that_is_not_there_is_one_line(words, why, capsys):
+    pytest.importorskip("nicegui")
+    pytest.importorskip("mctx")
+    assert main(["studio", *words]) == 2
+    told = capsys.readouterr().err
+    assert why in told and told.count("\n") == 1

@@ -14,6 +14,7 @@ from thorndike.functional.distributional import (
     midpoints,
     quantile_huber,
     quantiles,
+    two_hot,
 )
 
 RNG = np.random.default_rng(3)
@@ -135,3 +136,10 @@ def test_c51_says_the_mean_of_its_atoms():
     np.testing.assert_allclose(form.mean(logits), weights @ SUPPORT, rtol=1e-4, atol=1e-5)
     third = jnp.full((M, ACTIONS), 1 / ACTIONS)
     np.testing.assert_allclose(form.mix(logits, third), weights.mean(axis=1), rtol=1e-4)
+
+
+def test_two_hot_puts_a_number_between_its_neighbours():
+    inside = np.concatenate([RNG.uniform(-2, 3, 20), [-2.0, 3.0, -9.0, 9.0, -1.5]]).astype(np.float32)
+    by_hand = projected_by_hand(np.eye(ATOMS)[np.zeros(len(inside), int)], inside, np.zeros(len(inside)))
+    shaped = jax.jit(two_hot)(jnp.asarray(inside).reshape(5, 5), SUPPORT)
+    np.testing.assert_allclose(shaped.reshape(-1, ATOMS), by_hand, atol=1e-6)

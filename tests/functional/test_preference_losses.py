@@ -8,6 +8,7 @@ import pytest
 from thorndike.functional.preference_losses import (
     bradley_terry_loss,
     centring_penalty,
+    choice_loss,
     dpo_loss,
     plackett_luce_loss,
     ranked_pairs,
@@ -38,6 +39,26 @@ def test_bradley_terry_stays_finite_far_out():
     far = jnp.array([500.0, -500.0])
     gradient = jax.grad(lambda x: bradley_terry_loss(x, jnp.zeros(2), jnp.ones(2), jnp.ones(2)))(far)
     np.testing.assert_allclose(gradient, [0.0, -0.5], atol=1e-6)
+
+
+@COMPILED
+@pytest.mark.parametrize("error", [0.0, 0.1, 0.4])
+def test_a_choice_is_bradley_terry_on_sums_but_for_errors_at_random(error, compiled):
+    steps_first, steps_second = RNG.normal(size=(2, 40, 5)).astype(np.float32)
+    terms = []
+    for a, b, p in zip(steps_first, steps_second, P, strict=True):
+        chance = (1 - error) / (1 + np.exp(sum(map(float, b)) - sum(map(float, a)))) + error / 2
+        terms.append(-(p * np.log(chance) + (1 - p) * np.log(1 - chance)))
+    function = jax.jit(choice_loss) if compiled else choice_loss
+    found = function(*map(jnp.asarray, (steps_first.sum(1), steps_second.sum(1), P, WEIGHT)), error)
+    np.testing.assert_allclose(found, mean(terms, WEIGHT), rtol=1e-4)
+
+
+@pytest.mark.parametrize("error", [0.0, 0.1])
+def test_a_choice_stays_finite_far_out(error):
+    gradient = jax.grad(lambda x: choice_loss(x, jnp.zeros(2), jnp.ones(2), jnp.ones(2), error))(jnp.array([500.0, -500.0]))
+    # Where errors are possible, what cannot be else is one and teaches nothing.
+    np.testing.assert_allclose(gradient, [0.0, 0.0 if error else -0.5], atol=1e-6)
 
 
 def test_centring_is_of_the_sum_of_both_rewards():

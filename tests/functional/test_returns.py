@@ -50,6 +50,19 @@ def test_generalised_advantages_are_the_sum_of_discounted_errors(length, batch, 
     assert found.dtype == np.float32
 
 
+@COMPILED
+def test_where_two_players_take_turns_advantages_are_those_of_one_score_that_one_of_them_drives_up_and_the_other_down(compiled):
+    rows = random_rows(40, 3, seed=1)
+    # Nobody moves strictly in turn: a throw of the dice is several moves.
+    sides = np.where(np.random.default_rng(2).random((41, 3)) < 0.5, 1.0, -1.0).astype(np.float32)
+    side, following = sides[:-1], sides[1:]
+    function = maybe_jit(partial(generalized_advantage, gamma=GAMMA, gae_lambda=LAMBDA), compiled)
+    found = function(**jax.tree.map(jnp.asarray, rows), turn=jnp.asarray(side * following))
+    reward, value, next_value = side * rows["reward"], side * rows["value"], following * rows["next_value"]
+    expected = side * loop_advantage(reward, value, next_value, rows["terminated"], rows["done"], GAMMA, LAMBDA)
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
+
+
 def three_steps(terminated: bool, truncated: bool) -> np.ndarray:
     """Advantages of three steps of reward 1, whose second one may end the episode; V is 10 everywhere, 100 at the true successor."""
     column = jnp.array([[False], [True], [False]])

@@ -59,21 +59,11 @@ def test_every_tower_sees_where_pieces_are_and_begins_without_preference(tower: 
 def test_what_is_no_game_of_two_is_refused():
     with pytest.raises(UserError, match="learns games of two players, such as connect_four, and CartPole-v1 is none"):
         build_algorithm("alphazero", {}, td.make("CartPole-v1", 2).spec, None)
-    with pytest.raises(UserError, match="train alphazero on it"):
-        build_algorithm("ppo", {}, td.make("tic_tac_toe", 2).spec, None)
+    with pytest.raises(UserError, match="train ppo or alphazero or muzero on it"):
+        build_algorithm("a2c", {}, td.make("tic_tac_toe", 2).spec, None)
     spec = game_environment(TIC_TAC_TOE, 2).spec
-    with pytest.raises(UserError, match=r"two players without dice.*no learner here plays against itself by dice"):
+    with pytest.raises(UserError, match=r"two players without dice.*train it with ppo"):
         alphazero(Config(), spec._replace(game=TIC_TAC_TOE._replace(has_chance=True)))
-
-
-def chooser(run: Path, simulations: int) -> lines.Choose:
-    """The policy of a run, with that many simulations a move."""
-    loaded = td.load(run)
-    policy = loaded.policy
-    algorithm = build_algorithm("alphazero", {**loaded.facts["config"], "eval_simulations": simulations}, policy.spec, None)
-    actor, noise = jax.tree.map(lambda leaf: leaf[0], policy.actors), policy.noise(jax.random.key(0), lines.SIDE_BY_SIDE)
-    see = jax.vmap(lambda position: observed_position(TIC_TAC_TOE, position))
-    return jax.jit(lambda positions: algorithm.greedy(actor, algorithm.memory(lines.SIDE_BY_SIDE), see(positions), noise)[1])
 
 
 def test_a_run_is_saved_loaded_and_gone_on_with(tmp_path: Path, quick_compile: None):
@@ -93,7 +83,7 @@ def test_no_line_of_tic_tac_toe_is_lost_after_two_minutes(tmp_path: Path, capsys
     result = td.train("alphazero", "tic_tac_toe", output=tmp_path)
     assert result.cpu_s < 120
     for simulations in (0, 64):
-        choose = chooser(result.run, simulations)
+        choose = lines.chooser(result.run, simulations)
         walked = [lines.walk(choose, agent) for agent in (0, 1)]
         share = lines.optimal_share(choose)
         with capsys.disabled():

@@ -103,6 +103,17 @@ def test_an_interrupted_match_goes_on_where_it_was(tmp_path):
     assert longer.games[:8] == whole.games
 
 
+def test_games_of_a_run_before_it_was_trained_on_are_not_taken_for_its_own(tmp_path):
+    path = tmp_path / "match.jsonl"
+    before, after = (in_order("run")._replace(identity=identity) for identity in ("12", "34"))
+    play_match(TIC_TAC_TOE, (before, in_order("b")), 2, path=path)
+    kept = path.read_bytes()
+    with pytest.raises(UserError, match=r"holds games of a run that has been trained on since, or changed: keep the new ones in another"):
+        play_match(TIC_TAC_TOE, (after, in_order("b")), 4, path=path)
+    assert path.read_bytes() == kept
+    assert len(play_match(TIC_TAC_TOE, (before, in_order("b")), 4, path=path).games) == 4
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [

@@ -12,9 +12,10 @@ from thorndike.games.environment import game_environment, opening
 from thorndike.games.game import Game
 from thorndike.games.packing import packing
 from thorndike.games.search import Found
-from thorndike.games.self_play import Manners, as_batch, draw_moves, fresh_memory, move, players
+from thorndike.games.self_play import Manners, as_batch, draw_moves, fresh_memory, move
 from thorndike.games.settings import GameSettings
 from thorndike.games.tic_tac_toe import TIC_TAC_TOE
+from thorndike.games.turns import players
 from thorndike.replay.self_play import Rows, add_self_play, init_self_play, outcomes, sample_self_play
 
 pytestmark = pytest.mark.usefixtures("quick_compile")

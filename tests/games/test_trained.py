@@ -7,13 +7,13 @@ import pytest
 import thorndike as td
 import tic_tac_toe_lines as lines
 from thorndike.games.environment import observed_position
-from thorndike.games.registry import OWN_GAMES, game
+from thorndike.games.registry import game
 from thorndike.games.tic_tac_toe import TIC_TAC_TOE
 from thorndike.games.trained import trained_run
 
 
-@pytest.mark.parametrize("id", OWN_GAMES)
-def test_there_is_a_small_one_for_each_game_of_our_own(id):
+@pytest.mark.parametrize("id", ["tic_tac_toe", "connect_four"])
+def test_there_is_a_small_one_for_the_small_games(id):
     run = trained_run(id)
     assert run is not None
     assert sum(file.stat().st_size for file in run.rglob("*")) < 5_000_000
@@ -38,6 +38,14 @@ def test_the_one_of_tic_tac_toe_loses_no_line_even_without_searching():
 def test_its_strength_stands_in_its_name_so_that_kept_games_of_another_are_not_taken_for_its_own():
     assert td.player("trained", "tic_tac_toe").name == "trained"
     assert td.player("trained", "tic_tac_toe", simulations=8).name == "trained:simulations=8"
+
+
+def test_a_player_is_told_by_its_parameters_from_one_that_was_trained_on():
+    policy = td.load(trained_run("tic_tac_toe"))
+    identity = td.player(policy, "tic_tac_toe").identity
+    assert identity == td.player("trained", "tic_tac_toe").identity != ""
+    policy.policy.actors = jax.tree.map(lambda leaf: leaf + np.float32(1e-6), policy.policy.actors)
+    assert td.player(policy, "tic_tac_toe").identity != identity
 
 
 @pytest.mark.parametrize("name", ["", "no_such_game", "../tic_tac_toe", "tic_tac_toe/policy"])

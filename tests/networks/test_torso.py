@@ -131,6 +131,16 @@ def test_the_dense_layers_after_convolutions_are_those_asked_for():
     assert {name: layers[name]["kernel"].shape for name in ("Dense_0", "Dense_1")} == {"Dense_0": (1024, 32), "Dense_1": (32, 8)}
 
 
+def test_without_convolutions_an_image_goes_straight_to_the_dense_layers():
+    space = spaces.Box(0, 1, (10, 10, 4), bool)
+    torso = Torso(space, (8,), "relu", torch_uniform, cnn="none")
+    board = jax.random.bernoulli(jax.random.key(0), 0.3, (3, 10, 10, 4))
+    params = torso.init(jax.random.key(1), board)
+    (layer,) = jax.tree.leaves(params, is_leaf=lambda x: "kernel" in x)
+    expected = np.maximum(np.asarray(board, np.float32).reshape(3, -1) @ np.asarray(layer["kernel"]) + np.asarray(layer["bias"]), 0)
+    np.testing.assert_allclose(torso.apply(params, board), expected, rtol=1e-5, atol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("size", "stride", "same", "batch"),
     [(3, 1, False, 5), (4, 2, False, 5), (8, 4, False, 5), (3, 2, False, 5), (3, 1, True, 5), (4, 2, False, 515)],

@@ -70,6 +70,30 @@ def test_a_checkpoint_being_written_is_waited_for():
     assert seconds > 1.3
 
 
+IMPORTS = """
+import sys
+from thorndike.training.stopping import prompt_exit
+sys.path.insert(0, sys.argv[1])
+with prompt_exit():
+    try:
+        import slow_to_import
+    except BaseException as error:
+        print("unwound through the module", type(error), flush=True)
+        raise
+"""
+
+
+@pytest.mark.parametrize(("number", "word"), [(signal.SIGINT, "interrupted"), (signal.SIGTERM, "terminated")])
+def test_an_import_is_left_at_once_and_never_unwound(number, word, tmp_path):
+    """Compiled modules end by signal 6 or 11 where an exception comes in the middle of their import."""
+    (tmp_path / "slow_to_import.py").write_text("import time\nprint('ready', flush=True)\nfor _ in range(600): time.sleep(0.05)\n")
+    process = subprocess.Popen([sys.executable, "-c", IMPORTS, str(tmp_path)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    process.stdout.readline()
+    process.send_signal(number)
+    out, err = process.communicate(timeout=30)
+    assert (process.returncode, out, err) == (128 + number, "", f"thorndike: {word}\n")
+
+
 def test_requests_are_noted_and_the_handlers_put_back():
     noted = []
     before = signal.signal(signal.SIGINT, lambda *arguments: noted.append("second"))
@@ -101,9 +125,9 @@ def test_outside_the_main_thread_nothing_is_touched():
 
 
 def test_a_command_that_ends_leaves_everything_as_it_was():
-    before, threads = signal.getsignal(signal.SIGTERM), threading.active_count()
+    before, threads = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)], threading.active_count()
     with prompt_exit():
-        assert signal.getsignal(signal.SIGTERM) is not before
-    assert signal.getsignal(signal.SIGTERM) is before
+        assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] != before
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
     assert threading.active_count() == threads
     assert signal.set_wakeup_fd(-1) == -1

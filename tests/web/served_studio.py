@@ -1,7 +1,11 @@
-"""A studio with small players of the tests' own, in a process of its own: `python served_studio.py TOKEN [HOST]` prints the address."""
+"""A studio with small players of the tests' own, in a process of its own: served_studio.py TOKEN [HOST [STORE]] prints the address.
+
+With a preference store, its project ``clips`` is judged there, too.
+"""
 
 import sys
 import time
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +13,11 @@ import numpy as np
 
 from thorndike.errors import UserError
 from thorndike.games.game import Choice, Game, Player, Turn
+from thorndike.language.preferences.assignment import Plan
+from thorndike.language.preferences.store import Store
+from thorndike.web.home import Door
+from thorndike.web.label import Labelling
+from thorndike.web.label_server import doors_to
 from thorndike.web.opponents import Opponent
 from thorndike.web.server import serve
 
@@ -61,6 +70,11 @@ OPPONENTS = (
 )
 
 
+def doors(where: str) -> tuple[Door, ...]:
+    store = Store(where)
+    return doors_to(Labelling(store, store.project("clips"), "clips", Plan(), Path(where).parent))
+
+
 if __name__ == "__main__":
     serve(
         ("tic_tac_toe", "connect_four"),
@@ -69,4 +83,5 @@ if __name__ == "__main__":
         port=0,
         told=lambda address: print(address, flush=True),
         token=sys.argv[1],
+        doors=doors(sys.argv[3]) if len(sys.argv) > 3 else (),
     )

@@ -47,7 +47,7 @@ def test_a_damaged_run_is_left_out(tmp_path):
 def test_no_search_where_there_is_none_or_it_takes_too_long(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "program_of", lambda engine: "/usr/games/it")
     assert names("2048", tmp_path) == []
-    assert names("backgammon", tmp_path) == ["Random moves"]
+    assert names("backgammon", tmp_path) == ["GNU Backgammon", "Random moves"]
     assert names("chess", tmp_path) == ["Stockfish", "Fairy-Stockfish", "Random moves"]
     assert names("go_9x9", tmp_path) == ["Tree search, without a network", "GNU Go", "Random moves"]
 

@@ -21,11 +21,19 @@ class Entry(NamedTuple):
     learns_from: tuple[str, ...] = ("environment",)
     """``environment``, ``dataset``, or both."""
     plays: bool = False
-    """Whether it learns games of two by playing itself, and nothing else."""
+    """Whether it learns games of two by playing itself."""
+    only_games: bool = False
+    """Whether it learns nothing else."""
+    searches: bool = False
+    """Whether it acts by a search, which needs a game's rules."""
 
 
 ALGORITHMS: dict[str, Entry] = {
-    "ppo": Entry("thorndike.algorithms.ppo", "Proximal policy optimisation: actor-critic; all kinds of actions"),
+    "ppo": Entry(
+        "thorndike.algorithms.ppo",
+        "Proximal policy optimisation: actor-critic; all kinds of actions; games of two by playing itself",
+        plays=True,
+    ),
     "a2c": Entry("thorndike.algorithms.a2c", "Advantage actor-critic, the synchronous A3C; all kinds of actions"),
     "reinforce": Entry(
         "thorndike.algorithms.reinforce", "Policy gradient by whole returns, with or without a baseline; all kinds of actions"
@@ -132,6 +140,16 @@ ALGORITHMS: dict[str, Entry] = {
         num_envs=256,
         network=False,
         plays=True,
+        only_games=True,
+        searches=True,
+    ),
+    "muzero": Entry(
+        "thorndike.algorithms.muzero",
+        "MuZero: a tree search through a learnt model; games and Discrete actions",
+        ("Discrete",),
+        network=False,
+        plays=True,
+        searches=True,
     ),
     "planning": Entry(
         "thorndike.algorithms.planning",
@@ -146,10 +164,10 @@ ALGORITHMS: dict[str, Entry] = {
 
 def check_plays(algorithm: str, environment: str, of_two: bool) -> None:
     """Raises UserError if an algorithm for games is to learn something else, or another one a game ``of_two``, whose rewards take turns."""
-    players = [name for name, entry in ALGORITHMS.items() if entry.plays]
-    if ALGORITHMS[algorithm].plays and not of_two:
+    if ALGORITHMS[algorithm].only_games and not of_two:
         raise UserError(f"{algorithm} learns games of two players, such as connect_four, and {environment} is none: train it with ppo")
     if of_two and not ALGORITHMS[algorithm].plays:
+        players = [name for name, entry in ALGORITHMS.items() if entry.plays]
         raise UserError(
             f"{environment} is a game of two players: train {' or '.join(players)} on it, which play themselves, not {algorithm}"
         )

@@ -29,14 +29,15 @@ import optax
 from jaxtyping import Array, Float, Int, Key, PyTree
 
 from thorndike.errors import UserError
-from thorndike.functional.guards import accept_if, all_finite
+from thorndike.functional.descent import Averaged, clipped_adamw, descend_averaged
 from thorndike.functional.learning_dynamics import mean_square_gradient
 from thorndike.functional.policy_losses import weighted_mean
 from thorndike.functional.schedules import schedule
 from thorndike.games.game import Game, Position
 from thorndike.games.packing import Packing, packing
 from thorndike.games.search import SEARCHES, Evaluate, Found, SearchSettings, search
-from thorndike.games.self_play import Batch, Manners, as_batch, draw_moves, false_resignations, fresh_memory, move, players
+from thorndike.games.self_play import Batch, Manners, as_batch, draw_moves, false_resignations, fresh_memory, move
+from thorndike.games.turns import players
 from thorndike.networks.board import TOWERS, board_network, win_value
 from thorndike.networks.hidden_layers import look_into
 from thorndike.networks.masking import FORBIDDEN, MASK
@@ -65,7 +66,7 @@ class Config:
     eval_simulations: Annotated[int, AtLeast(0)] = 64  # when playing for strength; 0: the network alone
     considered_moves: Annotated[int, AtLeast(1)] = 16  # m of gumbel: moves tried at the root
     value_scale: Annotated[float, MoreThan(0)] = 0.5  # c_scale of gumbel: weight of values in [-1, 1] against the prior
-    rescale_values: bool = False  # gumbel: stretch the values of a node's moves to [0, 1] first
+    rescale_values: bool = False  # stretch the values of a node's moves to [0, 1] first
     c_puct: Annotated[float, MoreThan(0)] = 1.25  # c_init of puct: weight of the prior
     dirichlet_alpha: Annotated[float, MoreThan(0)] = 1.0  # alpha of puct's noise at the root
     dirichlet_fraction: Annotated[float, Between(0, 1)] = 0.25  # epsilon: its share of the prior there
@@ -175,15 +176,12 @@ def learn(parts: Parts, state: State, key: Key[Array, ""]) -> tuple[State, Metri
     batch = as_batch(parts.game, sampled, config.symmetries)
     (_, metrics), grads = jax.value_and_grad(alphazero_loss, has_aux=True)(state.params, batch, parts.network, config.vf_coef)
     rate = schedule(config.learning_rate)(state.env_steps / config.total_steps)
-    direction, opt_state = parts.optimizer.update(grads, state.opt_state, state.params)
-    metrics |= {"train/grad_norm": optax.tree.norm(grads), "train/learning_rate": rate}
+    held = Averaged(state.params, state.average, state.opt_state)
+    held, norm = descend_averaged(parts.optimizer, rate, config.averaging, held, grads, metrics["train/loss"])
+    metrics |= {"train/grad_norm": norm, "train/learning_rate": rate}
     metrics["train/known_outcomes"] = jnp.mean(batch.value_weight)
     metrics["train/resign_checks"], metrics["train/resign_errors"] = false_resignations(sampled)
-    params = jax.tree.map(lambda p, d: p - rate * d, state.params, direction)
-    average = jax.tree.map(lambda a, p: a + config.averaging * (p - a), state.average, params)
-    sound = all_finite(metrics["train/loss"], metrics["train/grad_norm"])
-    kept = accept_if(sound, (params, average, opt_state), (state.params, state.average, state.opt_state))
-    return state._replace(params=kept[0], average=kept[1], opt_state=kept[2]), metrics
+    return state._replace(params=held.params, average=held.average, opt_state=held.opt_state), metrics
 
 
 def look_at(parts: Parts, state: State) -> Metrics:
@@ -198,12 +196,9 @@ def alphazero(config: Config, spec: EnvSpec) -> Algorithm:
     """AlphaZero for a game. Raises ``UserError`` for an environment that is no game of two players without dice."""
     game = spec.game
     if game is None or game.num_players != 2 or game.has_chance:
-        instead = "no learner here plays against itself by dice" if game is not None and game.has_chance else "train it with ppo"
-        raise UserError(f"alphazero plays games of two players without dice (connect_four, ...), which {spec.id} is not: {instead}")
+        raise UserError(f"alphazero plays games of two players without dice (connect_four, ...), which {spec.id} is not: train it with ppo")
     network = board_network(game.num_actions, config.tower, config.width, config.blocks)
-    optimizer = optax.chain(
-        optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam(), optax.add_decayed_weights(config.weight_decay)
-    )
+    optimizer = clipped_adamw(config.max_grad_norm, config.weight_decay)
     parts = Parts(config, game, network, packing(game), optimizer, spec.num_envs)
 
     def prior(params: PyTree, obs: Observation) -> Float[Array, "B actions"]:

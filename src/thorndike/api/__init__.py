@@ -28,6 +28,7 @@ from thorndike.api.learners import (
     BootstrappedDQN,
     CrossQ,
     Learner,
+    MuZero,
     QLearning,
     Rainbow,
 )
@@ -66,6 +67,7 @@ __all__ = [
     "CrossQ",
     "Learner",
     "LoadedPolicy",
+    "MuZero",
     "OfflineEvaluation",
     "QLearning",
     "Rainbow",

@@ -73,6 +73,8 @@ class Request(NamedTuple):
     """``path`` and ``sha256`` of what is learnt from, where no environment is stepped; an update is then a step."""
     start_from: str | None = None
     """The offline run whose networks and dataset it began with."""
+    reward: dict[str, str] | None = None
+    """``path`` and ``sha256`` of the learnt reward that it began with, in place of the environment's own."""
 
 
 class Lanes(NamedTuple):
@@ -96,6 +98,8 @@ class Job(NamedTuple):
     runner: Runner
     plan: Plan
     close: Callable[[], None]
+    paused: bool = False
+    """Whether the plan ends before the request does."""
 
 
 def make(
@@ -187,6 +191,7 @@ def full_request(
     actors: ActorThreads = NO_THREADS,
     data: Dataset | None = None,
     start_from: str | None = None,
+    reward: dict[str, str] | None = None,
 ) -> Request:
     """What was asked for, and what the preset and the defaults add to it."""
     check_actors(algorithm, choice, actors)
@@ -209,6 +214,7 @@ def full_request(
         actors=actors._asdict() if actors.threads else None,
         dataset=None if data is None else {"path": str(data.path.absolute()), "sha256": data.sha256},
         start_from=start_from,
+        reward=reward,
     )
 
 

@@ -276,3 +276,9 @@ class AlphaZero(Learner):
     """A game of two, learnt by playing oneself."""
 
     algorithm = "alphazero"
+
+
+class MuZero(Learner):
+    """A tree search through a learnt model, for games and for environments with Discrete actions."""
+
+    algorithm = "muzero"

@@ -10,6 +10,7 @@ from thorndike.algorithms import ALGORITHMS
 from thorndike.api.building import build_algorithm
 from thorndike.environments.wrappers import from_settings
 from thorndike.errors import UserError
+from thorndike.games.environment import observes_game
 from thorndike.games.registry import game
 from thorndike.networks.network import NetworkBuilder
 from thorndike.records import from_policy, read_policy_facts
@@ -45,7 +46,7 @@ def _parts(facts: Json, network: NetworkBuilder | None) -> tuple[Algorithm, Wrap
     observations, actions = (space_from_json(cast(Json, facts[part])) for part in ("observation_space", "action_space"))
     limit = cast(int | None, facts["max_episode_steps"])
     environment, num_envs = cast(str, facts["environment"]), cast(int, facts["num_envs"])
-    rules = game(environment) if ALGORITHMS[name].plays else None
+    rules = game(environment) if ALGORITHMS[name].searches and observes_game(observations) else None
     spec = EnvSpec(environment, observations, actions, num_envs=num_envs, max_episode_steps=limit, game=rules)
     return build_algorithm(name, config, wrapper.spec(spec), network), wrapper, spec
 

@@ -11,6 +11,7 @@ from typing import NamedTuple, cast
 import numpy as np
 
 from thorndike.api.building import EnvironmentLike, Job
+from thorndike.api.learned_rewards import first_change
 from thorndike.api.recorded_run import Objects, rebuild, request_in
 from thorndike.api.starting import first_carry
 from thorndike.errors import UserError
@@ -70,6 +71,9 @@ def reproduce(
     run, objects = Path(run), Objects(environment, wrappers, network)
     record = read_record(run)
     request = request_in(record, run, objects)
+    changed = first_change(record)
+    if changed is not None and (steps is None or steps > changed):
+        raise UserError(f"{run} went on with another reward from step {changed}: it can be made again up to there: --steps {changed}")
     with closing(rebuild(record, request, run, objects)) as job, tempfile.TemporaryDirectory(prefix="thorndike-reproduce-") as folder:
         comparison = _Comparison(run, Path(folder), job, math.inf if steps is None else steps)
         plan = job.plan._replace(iterations=comparison.iterations[-1], also=comparison.iterations)

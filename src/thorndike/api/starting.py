@@ -1,4 +1,4 @@
-"""What a run begins with: fresh networks, or those of an offline run, with its dataset as the first content of replay."""
+"""What a run begins with: fresh networks, or those of an offline run with its dataset in the replay; and a learnt reward, if it has one."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from thorndike.api.building import Job, Request, build_job, recorded_data
+from thorndike.api.learned_rewards import recorded_reward, with_reward
 from thorndike.api.recorded_run import Objects, request_in
 from thorndike.environments import registry
 from thorndike.errors import UserError
@@ -37,6 +38,8 @@ def offline_request(run: Path, algorithm: str, environment: str) -> Request:
 def first_carry(job: Job) -> Carry:
     """The carry of a run's first iteration."""
     carry = job.runner.init()
+    if job.request.reward is not None:
+        carry = with_reward(carry, job, recorded_reward(job.request.reward))
     if job.request.start_from is None:
         return carry
     run = Path(job.request.start_from)

@@ -19,6 +19,7 @@ from thorndike.api.building import (
     prepare_devices,
 )
 from thorndike.api.exporting import export_policy
+from thorndike.api.learned_rewards import begun_with, reward_of, with_change, with_reward
 from thorndike.api.planning import plan_run
 from thorndike.api.recorded_run import Objects, rebuild, request_in
 from thorndike.api.starting import first_carry, offline_request
@@ -73,6 +74,8 @@ def train(
     actor_schedule: str = "fixed",
     env_restarts: int = 0,
     start_from: str | Path | None = None,
+    reward: str | Path | None = None,
+    until: int | None = None,
     progress: bool = False,
     command: str | None = None,
 ) -> Result:
@@ -87,13 +90,13 @@ def train(
     divides; that changes how long it takes and no result. ``env_timeout`` is how many seconds a step of an environment in a process of
     its own may take (60 by default), a reset twice that. ``actor_threads`` play host environments while the learner learns, each a pool of
     ``num_envs`` of its own, on the ``fixed`` schedule, which can be repeated, or the ``free`` one; ``env_restarts`` is how often a pool may
-    be made anew after a fault. Raises ``UserError`` for anything that cannot be.
+    be made anew. ``reward`` is a folder of clips, or a reward learnt in one; ``until`` pauses at a step. Raises ``UserError``.
     """
     check_algorithm(algorithm)
     _check_numbers(seed, seeds, num_envs)
     check_source(algorithm, environment)
     of_stepping: dict[str, object] = {"num_envs": num_envs, "wrappers": wrappers, "start_from": start_from, "devices": devices}
-    of_stepping |= {"actor_threads": actor_threads, "env_restarts": env_restarts}
+    of_stepping |= {"actor_threads": actor_threads, "env_restarts": env_restarts, "reward": reward, "until": until}
     data = read_dataset(str(environment)) if is_dataset(environment) else None
     if data is not None:
         of_stepping |= {"env_kwargs": env_kwargs, "max_episode_steps": max_episode_steps, "engine": None if engine == "auto" else engine}
@@ -105,19 +108,17 @@ def train(
         return plan_run(choice, settings or {}, output, name, command)
     settings, started = _begun(start_from, algorithm, choice.id, dict(settings or {}))
     actors = ActorThreads(actor_threads, actor_schedule, env_restarts)
+    learnt, wrappers = begun_with(reward, choice.id, wrappers, found.wrappers)
     request = full_request(
-        algorithm, choice, found, wrappers, settings, steps, num_envs, seeds, seed, checkpoint_every, actors, data, started
+        algorithm, choice, found, wrappers, settings, steps, num_envs, seeds, seed, checkpoint_every, actors, data, started, learnt
     )
     if data is None:
         prepare_devices(choice, seeds, devices)
     backend = startup.choose_device(device, is_large(algorithm, choice))
-    job = build_job(request, choice, wrappers, network, env_timeout, devices=startup.device_count(devices))
-    run = new_run_directory(output, choice.id, algorithm, name)
+    job = _until(build_job(request, choice, wrappers, network, env_timeout, devices=startup.device_count(devices)), until)
     objects = {"network": "user" if network else "default", "environment_object": not isinstance(environment, str)}
     record = {**facts(), "status": "running", "command": command, "device": backend, **objects, **as_json(request)}
-    with closing(job), run_lock(run):
-        _begin_record(run, record)
-        return _conduct(run, record, job, progress, lambda: Start(first_carry(job)))
+    return _from_the_start(job, new_run_directory(output, choice.id, algorithm, name), record, progress)
 
 
 def resume(
@@ -128,12 +129,15 @@ def resume(
     wrappers: Sequence[Wrapper] | None = None,
     network: NetworkBuilder | None = None,
     env_timeout: float | None = None,
+    reward: str | Path | None = None,
+    until: int | None = None,
     progress: bool = False,
 ) -> Result:
     """Go on with an interrupted run from its last checkpoint, or train a finished one further, to ``steps`` in all.
 
     A run that was stopped before its first checkpoint begins again. ``environment``, ``wrappers`` and ``network`` are needed again where
-    they were Python objects. Raises ``UserError`` if the run cannot go on, or another process is writing it.
+    they were Python objects. ``reward`` is what a run that was begun with a learnt reward learns from, from here on; ``until`` pauses it at
+    so many steps. Raises ``UserError`` if the run cannot go on, or another process is writing it.
     """
     run, objects = Path(run), Objects(environment, wrappers, network)
     read_record(run)
@@ -146,8 +150,14 @@ def resume(
         _need_checkpoint(run)
         if request.actors is not None and request.actors.get("schedule") == "free":
             notice(f"the actor threads of {run} run freely: what is trained from here on is not bit for bit what it would have been")
-        with closing(rebuild(record, request, run, objects, env_timeout)) as job:
+        if reward is not None and request.reward is None:
+            raise UserError(f"{run} was not begun with a learnt reward: train a new run with one, --reward")
+        with closing(_until(rebuild(record, request, run, objects, env_timeout), until)) as job:
             start = _restored(run, job)
+            if reward is not None:
+                stored = reward_of(reward, request.environment)
+                record = with_change(record, stored, start.progressed.iteration * job.runner.steps_per_iteration)
+                start = start._replace(carry=with_reward(start.carry, job, stored))
             record = {**record, **as_json(request), "status": "running"}
             _begin_record(run, record)
             return _conduct(run, record, job, progress, lambda: start)
@@ -181,6 +191,23 @@ def refuse_given(arguments: Mapping[str, object], why: str) -> None:
             raise UserError(f"{why}: leave {name} out")
 
 
+def _from_the_start(job: Job, run: Path, record: Json, progress: bool) -> Result:
+    with closing(job), run_lock(run):
+        _begin_record(run, record)
+        return _conduct(run, record, job, progress, lambda: Start(first_carry(job)))
+
+
+def _until(job: Job, until: int | None) -> Job:
+    """The same job, paused at so many steps: of host environments at a checkpoint, where they start afresh."""
+    if until is None:
+        return job
+    if until < 1:
+        raise UserError(f"a run is paused at one of its steps, from 1 on, not at {until}")
+    every = 1 if job.request.engine == "native" else job.plan.checkpoint_every
+    iterations = math.ceil(until / (job.runner.steps_per_iteration * every)) * every
+    return job._replace(plan=job.plan._replace(iterations=min(iterations, job.plan.iterations)), paused=iterations < job.plan.iterations)
+
+
 def _conduct(run: Path, record: Json, job: Job, progress: bool, begin: Callable[[], Start]) -> Result:
     """Run the session; whatever happens, ``run.json`` says how it ended."""
     spent = Stopwatch()
@@ -196,6 +223,8 @@ def _conduct(run: Path, record: Json, job: Job, progress: bool, begin: Callable[
         with Progress(job.request.steps, progress, done_steps=start.progressed.iteration * per_iteration) as bar:
             spent.stop()
             outcome = run_session(run, job.runner, job.source, job.plan, start.later(spent.wall, spent.cpu), keeping, bar)
+            if job.paused and outcome.status == "finished":
+                outcome = outcome._replace(status="interrupted")
     except NotFinite as error:
         _note(run, {**record, "status": "failed", "error": str(error)})
         raise UserError(_explained(run, job, error)) from error

@@ -3,16 +3,19 @@
 import importlib.util
 from pathlib import Path
 
-from thorndike.cli.find_run import all_runs, exists, find_run, read_facts
+from thorndike.cli.find_run import exists, find_run
 from thorndike.errors import UserError
 from thorndike.games.player_names import check_player, is_run, known_players, suggestion
 from thorndike.games.registry import FOR_ONE, WITH_DICE, game, game_ids
 from thorndike.records import from_policy, read_policy_facts
 from thorndike.suggestions import did_you_mean
+from thorndike.training.run_listing import all_runs, read_facts
 from thorndike.user_code import lasting_name
 
 GAME_HELP = "a game: connect_four, othello, go_9x9, chess, ...; or yours, path/to/file.py:NAME"
-PLAYER_HELP = "random, mcts, mcts:simulations=400, trained, gnugo:level=3, rhino:level=3, stockfish:elo=1500, fairy:skill=-10, or a run"
+PLAYER_HELP = (
+    "random, mcts, mcts:simulations=400, trained, gnugo:level=3, rhino:level=3, gnubg, stockfish:elo=1500, fairy:skill=-10, or a run"
+)
 
 
 def check_game(name: str, alone: bool) -> bool:

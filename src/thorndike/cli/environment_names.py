@@ -55,7 +55,7 @@ def _check_place(name: str) -> None:
 def _check_actions(algorithm: str, choice: "Choice") -> None:
     """Raises UserError if the algorithm does not take the environment's actions. Asked of Gymnasium's, which needs no JAX."""
     fitting, name = ALGORITHMS[algorithm].actions, choice.id
-    if ALGORITHMS[algorithm].plays or is_game(name):
+    if ALGORITHMS[algorithm].only_games or is_game(name):
         check_plays(algorithm, name, is_game(name) and ALGORITHMS[algorithm].plays)
         return
     # All MinAtar games have Discrete actions; to ask their package would import Matplotlib and pandas.

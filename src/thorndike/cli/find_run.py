@@ -1,4 +1,4 @@
-"""From what a user calls a run to its directory. Reads JSON files only: listing runs must not wait for JAX."""
+"""From what a user calls a run to its directory."""
 
 import os
 from argparse import ArgumentParser
@@ -6,9 +6,7 @@ from pathlib import Path
 
 from thorndike.errors import UserError
 from thorndike.suggestions import nearest
-from thorndike.training.json_files import parse_object, read_object
-
-FACTS = "run.json"
+from thorndike.training.run_listing import FACTS, all_runs
 
 
 def add_run_arguments(parser: ArgumentParser, several: bool = False) -> None:
@@ -24,16 +22,6 @@ def add_run_arguments(parser: ArgumentParser, several: bool = False) -> None:
 def add_output_argument(parser: ArgumentParser) -> None:
     """``--output DIR``, where runs live."""
     parser.add_argument("--output", metavar="DIR", type=Path, default=Path("runs"), help="the folder that runs are in (default: runs)")
-
-
-def all_runs(output: Path) -> list[Path]:
-    """Every run directory under `output`, oldest first (run directories start with their date and time)."""
-    found: list[Path] = []
-    for directory, below, files in os.walk(output):
-        if FACTS in files:
-            found.append(Path(directory))
-            below.clear()
-    return sorted(found, key=lambda run: (run.name[:15], run.joinpath(FACTS).stat().st_mtime_ns))
 
 
 def find_run(text: str, output: Path) -> Path:
@@ -70,14 +58,3 @@ def exists(path: Path) -> bool:
 def is_file(path: Path) -> bool:
     """Whether there is a file; a name that no file could have is none."""
     return os.path.isfile(path)
-
-
-def read_facts(run: Path) -> dict[str, object]:
-    """What ``run.json`` says. Raises UserError if it is no JSON object."""
-    return read_object(run / FACTS)
-
-
-def last_row(path: Path) -> dict[str, object]:
-    """The last complete line of a ``.jsonl`` file as an object; empty if there is none."""
-    lines = path.read_bytes().split(b"\n")[:-1] if path.is_file() else []
-    return parse_object(lines[-1], path) if lines else {}

@@ -6,7 +6,7 @@ from typing import TypeAlias
 
 from thorndike.algorithms import ALGORITHMS
 from thorndike.cli.answer import Answer
-from thorndike.cli.find_run import add_output_argument, all_runs, last_row, read_facts
+from thorndike.cli.find_run import add_output_argument
 from thorndike.cli.parser import Parser
 from thorndike.cli.tables import mean, table
 from thorndike.config_fields import read_config_fields
@@ -14,6 +14,7 @@ from thorndike.errors import UserError
 from thorndike.games.registry import game_ids
 from thorndike.settings import describe_kind
 from thorndike.suggestions import did_you_mean
+from thorndike.training.run_listing import all_runs, last_row, read_facts
 
 Row: TypeAlias = dict[str, object]
 

@@ -35,6 +35,7 @@ VERBS: dict[str, Verb] = {
     "studio": Verb("thorndike.cli.studio", "", "play games in the browser, on this machine"),
     "arena": Verb("thorndike.cli.arena", "GAME PLAYER PLAYER...", "let agents and programs play each other, and rate them"),
     "play": Verb("thorndike.cli.play", "GAME", "play a game against an agent or a program, here in the terminal"),
+    "clips": Verb("thorndike.cli.clips", "VERB ...", "a reward learnt from choices between clips of behaviour, and agents trained on it"),
     "language": Verb("thorndike.cli.language", "VERB ...", "language models: generate, chat, pretrain, fine-tune, preferences of people"),
     "check-env": Verb("thorndike.cli.check_env", "ENVIRONMENT", "say what is wrong with an environment, with fixes"),
     "list": Verb("thorndike.cli.list", "[WHAT]", "list runs, algorithms, environments, presets or settings"),

@@ -1,6 +1,7 @@
 """Argument parsing that answers a mistake in one line, and takes the flags other libraries' users know."""
 
 import argparse
+import math
 import re
 from collections.abc import Sequence
 from typing import NoReturn
@@ -62,6 +63,17 @@ def seed_number(text: str) -> int:
         raise argparse.ArgumentTypeError(f"expected a whole number of at least 0; got '{text}'")
     if number >= 2**32:
         raise argparse.ArgumentTypeError(f"expected a number from 0 to 2^32 - 1; got '{text}'")
+    return number
+
+
+def at_least_zero(text: str) -> float:
+    """A finite number of at least 0."""
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not 0.0 <= number < math.inf:
+        raise argparse.ArgumentTypeError(f"expected a number of at least 0; got '{text}'")
     return number
 
 

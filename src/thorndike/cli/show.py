@@ -5,11 +5,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from thorndike.cli.answer import Answer
-from thorndike.cli.find_run import add_run_arguments, find_run, last_row, read_facts
+from thorndike.cli.find_run import add_run_arguments, find_run
 from thorndike.cli.parser import Parser
 from thorndike.cli.tables import facts_table, mean
 from thorndike.statistics.estimates import summary
 from thorndike.training.json_files import NUMBER, check_fields, parse_object, whole
+from thorndike.training.run_listing import last_row, read_facts
 
 if TYPE_CHECKING:
     from rich.console import RenderableType

@@ -35,6 +35,7 @@ EXAMPLES = """\
   thorndike train q_learning FrozenLake-v1 --env-set is_slippery=False
   thorndike train ppo my_module:MyEnv-v0 --seeds 4 --json
   thorndike train ppo DeepSea-v0 --wrap random_network_distillation
+  thorndike train ppo Pendulum-v1 --reward runs/swing
   thorndike train iql datasets/CartPole-v1/ppo-v0 --steps 20k
 
 every setting of an algorithm (`thorndike list settings ppo`) may also stand as a flag: --learning-rate 1e-3"""
@@ -59,6 +60,7 @@ def run(words: Sequence[str]) -> Answer:
             algorithm=algorithm,
         )
         check_preset(algorithm, environment, options.preset)
+    check_reward(options.reward)
     start_from = None if options.start_from is None else find_run(options.start_from, options.output)
     wrapper_settings = [parse_wrapper(text) for text in options.wrap]
     from thorndike.api import train
@@ -86,6 +88,7 @@ def run(words: Sequence[str]) -> Answer:
         env_restarts=options.env_restarts,
         wrappers=[build_wrapper(each) for each in wrapper_settings] or None,
         start_from=start_from,
+        reward=options.reward,
         progress=not options.json,
         command=shlex.join(["thorndike", "train", *words]),
     )
@@ -253,6 +256,9 @@ def _parse(words: Sequence[str]) -> Namespace:
         metavar="WRAPPER",
         help="a wrapper in place of the preset's, as in 'count_bonus(coefficient=0.1)'; may be repeated, the first nearest the environment",
     )
+    parser.add_argument(
+        "--reward", type=Path, metavar="DIR", help="a folder of clips; the reward learnt in it (thorndike clips) is what is trained on"
+    )
     parser.add_argument("--start-from", metavar="RUN", help="a run of the same algorithm on a dataset, to go on from online (awac)")
     parser.add_argument("--name", help="the last part of the run directory's name")
     parser.add_argument("--checkpoint-every", type=positive_whole, metavar="STEPS", help="steps between two checkpoints")
@@ -266,6 +272,12 @@ def _parse(words: Sequence[str]) -> Namespace:
         "--env-restarts", type=positive_whole, default=0, metavar="N", help="faults after which a thread's environments are made anew"
     )
     return parser.parse(words)
+
+
+def check_reward(folder: Path | None) -> None:
+    """Raises UserError if there is no learnt reward."""
+    if folder is not None and not ((folder / "reward.json").is_file() or (folder / "clips.json").is_file()):
+        raise UserError(f"--reward {folder} holds no learnt reward: give a folder of clips in which thorndike clips fit has made one")
 
 
 def check_output(output: Path) -> None:

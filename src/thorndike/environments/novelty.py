@@ -19,19 +19,20 @@ import numpy as np
 import optax
 from gymnasium import spaces
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, Int, Key, PyTree, Shaped
+from jaxtyping import Array, Float, Int, Key, PyTree
 
-from thorndike.environments.observation_views import space_leaves
+from thorndike.environments.observation_views import as_numbers, joined, numbers_shape, shown_leaves, space_leaves
 from thorndike.errors import UserError
 from thorndike.functional.descent import Optimized, descend, optimized
 from thorndike.functional.guards import accept_if, all_finite
 from thorndike.functional.normalization import Moments, empty_moments, merge_moments, moments_of, normalize, running_returns, scale
 from thorndike.functional.policy_losses import weighted_mean
-from thorndike.networks.masking import MASK, without_mask
+from thorndike.networks.masking import without_mask
 from thorndike.networks.network import Network, flattened
 from thorndike.networks.torso import Torso
 from thorndike.types import Action, EnvSpec, Observation, Rollout, Step, Wrapper
 
+NAME = "random_network_distillation"
 CLIP = 5.0
 """Of normalised observations: Burda et al. 2018, section 2.4."""
 
@@ -71,11 +72,11 @@ def random_network_distillation(
     adam, widths = optax.scale_by_adam(), tuple(net_arch)
 
     def networks(moments: tuple[Moments, ...]) -> tuple[Network, Network, Array]:
-        example = _joined(tuple(own.mean[None] for own in moments))
+        example = joined(tuple(own.mean[None] for own in moments))
         return _features(example, widths, features), _features(example, (*widths, *widths[-1:]), features), example
 
     def statistics(env_spec: EnvSpec) -> Distilled:
-        moments = tuple(empty_moments(_shape_of(leaf)) for leaf in space_leaves(without_mask(env_spec.observation_space)))
+        moments = tuple(empty_moments(numbers_shape(leaf)) for leaf in space_leaves(without_mask(env_spec.observation_space)))
         return drawn(moments, jax.random.key(0))
 
     def drawn(moments: tuple[Moments, ...], key: Key[Array, ""]) -> Distilled:
@@ -87,7 +88,7 @@ def random_network_distillation(
         valid, reward = rollout.step.valid, rollout.step.reward
         rows = _numbers(rollout.step.next_obs, statistics.observations)
         moments = tuple(merge_moments(own, moments_of(row, valid)) for own, row in zip(statistics.observations, rows, strict=True))
-        seen = _joined(tuple(_flat_time(normalize(row, own, clip=CLIP)) for row, own in zip(rows, moments, strict=True)))
+        seen = joined(tuple(_flat_time(normalize(row, own, clip=CLIP)) for row, own in zip(rows, moments, strict=True)))
         target, predictor, example = networks(moments)
         predict, goal = flattened(predictor, example).apply, jnp.asarray(flattened(target, example).apply(statistics.target, seen))
         error = _error(jnp.asarray(predict(statistics.predictor.params, seen)), goal).reshape(valid.shape) * valid
@@ -98,9 +99,8 @@ def random_network_distillation(
         held = _distil(predict, statistics.predictor, batches, adam, learning_rate, n_epochs)
         return Distilled(statistics.target, held, moments, spread), memory, _rewarded(rollout, reward + bonus)
 
-    settings = {"name": "random_network_distillation", "gamma": gamma, "net_arch": list(widths), **numbers}
-    name = str(settings["name"])
-    return Wrapper(name, settings, _same_spec, statistics, _zeros, _as_it_is, learn, lambda own, key: drawn(own.observations, key))
+    settings = {"name": NAME, "gamma": gamma, "net_arch": list(widths), **numbers}
+    return Wrapper(NAME, settings, _same_spec, statistics, _zeros, _as_it_is, learn, lambda own, key: drawn(own.observations, key))
 
 
 def count_bonus(coefficient: float = 0.1, resolution: float = 1.0, table_bits: int = 20) -> Wrapper:
@@ -184,34 +184,12 @@ def _minibatches(rows: tuple[Array, ...], size: int) -> tuple[Array, ...]:
     return tuple(cut(x) for x in rows)
 
 
-def _shape_of(leaf: spaces.Space) -> tuple[int, ...]:
-    return (int(leaf.n),) if isinstance(leaf, spaces.Discrete) else tuple(leaf.shape or ())
-
-
-def _leaves(obs: Observation) -> list[Shaped[Array, "T B ..."]]:
-    shown = {name: part for name, part in obs.items() if name != MASK} if isinstance(obs, dict) else obs
-    return [jnp.asarray(leaf) for leaf in jax.tree.leaves(shown)]
-
-
 def _numbers(obs: Observation, moments: tuple[Moments, ...]) -> tuple[Float[Array, "T B ..."], ...]:
     """Every leaf as floats of the shape of its moments."""
-    leaves = _leaves(obs)
-    shapes = [own.mean.shape for own in moments]
-    found = [
-        # A Discrete space may start at any number: the remainder numbers its elements all the same.
-        jax.nn.one_hot(leaf % shape[0], shape[0]) if leaf.ndim == 2 and len(shape) == 1 else leaf.astype(jnp.float32)
-        for leaf, shape in zip(leaves, shapes, strict=False)
-    ]
-    if len(leaves) != len(shapes) or [row.shape[2:] for row in found] != shapes:
-        raise UserError("random_network_distillation looks at what the learner sees: put it after the wrappers that change the observation")
-    return tuple(found)
-
-
-def _joined(rows: tuple[Float[Array, "N ..."], ...]) -> Float[Array, "N ..."]:
-    """One picture as it is; anything else as one row of numbers."""
-    if len(rows) == 1 and rows[0].ndim == 4:
-        return rows[0]
-    return jnp.concatenate([row.reshape(row.shape[0], -1) for row in rows], axis=-1)
+    try:
+        return as_numbers(shown_leaves(obs), [own.mean.shape for own in moments], leading=2)
+    except UserError as error:
+        raise UserError(f"{NAME} looks at what the learner sees: put it after the wrappers that change the observation") from error
 
 
 def _flat_time(x: Float[Array, "T B ..."]) -> Float[Array, "N ..."]:
@@ -220,7 +198,7 @@ def _flat_time(x: Float[Array, "T B ..."]) -> Float[Array, "N ..."]:
 
 def _place(obs: Observation, size: int, resolution: float) -> Int[Array, " N"]:
     """Which of ``size`` counts each observation has."""
-    leaves = [_flat_time(leaf) for leaf in _leaves(obs)]
+    leaves = [_flat_time(leaf) for leaf in shown_leaves(obs)]
     if len(leaves) == 1 and leaves[0].ndim == 1 and jnp.issubdtype(leaves[0].dtype, jnp.integer):
         return leaves[0].astype(jnp.int32) % size
     whole = [jnp.floor(leaf.reshape(leaf.shape[0], -1).astype(jnp.float32) / resolution).astype(jnp.int32) for leaf in leaves]

@@ -8,10 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from gymnasium import spaces
-from jaxtyping import Array, Bool, Float, Int32
+from jaxtyping import Array, Bool, Float, Int32, Shaped
 
 from thorndike.errors import UserError
 from thorndike.functional.normalization import Moments, empty_moments
+from thorndike.networks.masking import MASK
 from thorndike.types import Observation
 
 Bound: TypeAlias = float | Sequence[float | None] | None
@@ -95,6 +96,37 @@ def on_floats(function: Callable[[Array, Moments], Array], obs: Observation, mom
 def fresh_moments(like: tuple[Moments | tuple[()], ...], batch: tuple[int, ...]) -> tuple[Moments | tuple[()], ...]:
     """Empty moments ``[*batch, *shape]`` for each of `like` ``[*shape]``."""
     return tuple(empty_moments(own.mean.shape, batch) if own else () for own in like)
+
+
+def numbers_shape(leaf: gymnasium.Space) -> tuple[int, ...]:
+    """The shape of a leaf's observations as ``as_numbers`` gives them: a Discrete one is a one-hot row."""
+    return (int(leaf.n),) if isinstance(leaf, spaces.Discrete) else tuple(leaf.shape or ())
+
+
+def shown_leaves(obs: Observation) -> list[Shaped[Array, "..."]]:
+    """The leaves of an observation, without its action mask."""
+    shown = {name: part for name, part in obs.items() if name != MASK} if isinstance(obs, dict) else obs
+    return [jnp.asarray(leaf) for leaf in jax.tree.leaves(shown)]
+
+
+def as_numbers(leaves: Sequence[Shaped[Array, "..."]], shapes: Sequence[tuple[int, ...]], leading: int) -> tuple[Float[Array, "..."], ...]:
+    """Every leaf, behind so many leading axes, as floats of these shapes. Raises UserError where they are of another space."""
+    found = [
+        # A Discrete space may start at any number: the remainder numbers its elements all the same.
+        jax.nn.one_hot(leaf % shape[0], shape[0]) if leaf.ndim == leading and len(shape) == 1 else leaf.astype(jnp.float32)
+        for leaf, shape in zip(leaves, shapes, strict=False)
+    ]
+    seen = [row.shape[leading:] for row in found]
+    if len(leaves) != len(shapes) or seen != list(shapes):
+        raise UserError(f"observations of the shapes {list(shapes)} were expected, not {[leaf.shape[leading:] for leaf in leaves]}")
+    return tuple(found)
+
+
+def joined(rows: tuple[Float[Array, "N ..."], ...]) -> Float[Array, "N ..."]:
+    """One picture as it is; anything else as one row of numbers."""
+    if len(rows) == 1 and rows[0].ndim == 4:
+        return rows[0]
+    return jnp.concatenate([row.reshape(row.shape[0], -1) for row in rows], axis=-1)
 
 
 def stacked_space(space: gymnasium.Space, k: int) -> gymnasium.Space:

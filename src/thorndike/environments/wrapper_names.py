@@ -22,6 +22,7 @@ MODULES: Mapping[str, str] = MappingProxyType(
         "discretise": _WRAPPERS,
         "end_at_cost": _WRAPPERS,
         "frame_stack": _WRAPPERS,
+        "learned_reward": "thorndike.environments.learned_reward",
         "normalize_observation": _WRAPPERS,
         "normalize_reward": _WRAPPERS,
         "random_network_distillation": _NOVELTY,
@@ -29,6 +30,8 @@ MODULES: Mapping[str, str] = MappingProxyType(
     }
 )
 """Name -> the module of the function of that name."""
+LEARNT = "learned_reward"
+"""Comes with a folder that it was learnt in, not from words alone."""
 _KINDS: Mapping[str, tuple[tuple[type, ...], str]] = MappingProxyType(
     {
         "int": ((int,), "a whole number"),
@@ -55,8 +58,11 @@ def parse_wrapper(text: str) -> dict[str, object]:
     Raises UserError for text of another form, a wrapper or a setting that does not exist, one that is missing or of another type.
     """
     name, values = _call(text)
+    if name == LEARNT:
+        raise UserError(f"--wrap {text}: a learnt reward is given by the folder that it was learnt in: --reward DIR")
     if name not in MODULES:
-        raise UserError(f"--wrap {text}: there is no wrapper '{name}'{did_you_mean(name, MODULES)}; one of {', '.join(MODULES)}")
+        offered = [each for each in MODULES if each != LEARNT]
+        raise UserError(f"--wrap {text}: there is no wrapper '{name}'{did_you_mean(name, offered)}; one of {', '.join(offered)}")
     known, required = _signature(name)
     for key, value in values.items():
         if key not in known:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, Int, PyTree
 
+from thorndike.functional.guards import accept_if, all_finite
 from thorndike.types import Metrics, Number
 
 
@@ -29,6 +30,38 @@ def descend(
     """The parameters after a step of size ``rate`` along the optimiser's direction, and the norm of the gradient."""
     direction, opt_state = optimizer.update(gradient, held.opt_state)
     return Optimized(held.params - rate * direction, opt_state), jnp.sqrt(jnp.sum(jnp.square(gradient)))
+
+
+class Averaged(NamedTuple):
+    """Parameters of any form, the running average of them, and the state of their optimiser."""
+
+    params: PyTree
+    average: PyTree
+    opt_state: PyTree
+
+
+def clipped_adamw(max_grad_norm: Number, weight_decay: Number) -> optax.GradientTransformation:
+    """Adam with decoupled weight decay, the gradient's global norm clipped before."""
+    return optax.chain(optax.clip_by_global_norm(max_grad_norm), optax.scale_by_adam(), optax.add_decayed_weights(weight_decay))
+
+
+def averaged(params: PyTree, optimizer: optax.GradientTransformation) -> Averaged:
+    """Parameters before their first step."""
+    return Averaged(params, jax.tree.map(jnp.copy, params), optimizer.init(params))
+
+
+def descend_averaged(
+    optimizer: optax.GradientTransformation, rate: Number, averaging: Number, held: Averaged, gradient: PyTree, loss: Float[Array, ""]
+) -> tuple[Averaged, Float[Array, ""]]:
+    """The parameters after a step of size ``rate``, their average moved to them by ``averaging``, and the norm of the gradient.
+
+    All stays as it was where that norm or the loss is not a number.
+    """
+    direction, opt_state = optimizer.update(gradient, held.opt_state, held.params)
+    params = jax.tree.map(lambda p, d: p - rate * d, held.params, direction)
+    average = jax.tree.map(lambda a, p: a + averaging * (p - a), held.average, params)
+    norm = optax.tree.norm(gradient)
+    return accept_if(all_finite(loss, norm), Averaged(params, average, opt_state), held), norm
 
 
 def follow(target: Float[Array, "..."], params: Float[Array, "..."], tau: Number) -> Float[Array, "..."]:

@@ -136,12 +136,20 @@ def categorical_projection(
     Each moved atom gives its probability to its two neighbours by nearness: the sum over atoms of a triangle around each, which has no
     scatter in it.
     """
-    low, high, count = support[0], support[-1], support.shape[0]
-    moved = jnp.clip(reward[:, None] + discount[:, None] * support[None, :], low, high)
-    place = (moved - low) / (high - low) * (count - 1)
-    atoms = jnp.arange(count, dtype=jnp.float32)
-    nearness = jnp.clip(1.0 - jnp.abs(place[:, None, :] - atoms[None, :, None]), 0.0, 1.0)
+    moved = reward[:, None] + discount[:, None] * support[None, :]
+    nearness = jnp.swapaxes(two_hot(moved, support), 1, 2)
     return jnp.sum(nearness * probabilities[:, None, :], axis=-1)
+
+
+def two_hot(x: Float[Array, "*B"], support: Float[Array, " K"]) -> Float[Array, "*B K"]:
+    """A number as probabilities of the two atoms next to it, by nearness; beyond the ends it is the atom there.
+
+    ``support`` is evenly spaced.
+    """
+    low, high, count = support[0], support[-1], support.shape[0]
+    place = (jnp.clip(x, low, high) - low) / (high - low) * (count - 1)
+    atoms = jnp.arange(count, dtype=jnp.float32).reshape((1,) * x.ndim + (count,))
+    return jnp.clip(1.0 - jnp.abs(place[..., None] - atoms), 0.0, 1.0)
 
 
 class Support(NamedTuple):

@@ -23,6 +23,20 @@ def bradley_terry_loss(
     return -weighted_mean(p_first * jax.nn.log_sigmoid(margin) + (1.0 - p_first) * jax.nn.log_sigmoid(-margin), weight)
 
 
+def choice_loss(
+    first: Float[Array, "*B"], second: Float[Array, "*B"], p_first: Float[Array, "*B"], weight: Float[Array, "*B"], error_rate: Number = 0.0
+) -> Float[Array, ""]:
+    """Cross-entropy of choices between two clips, whose predicted rewards sum to ``first`` and ``second``.
+
+    ``P(first) = (1 - e) sigmoid(first - second) + e / 2``: by Bradley-Terry, but in a share ``error_rate`` of cases at random.
+    Christiano et al. 2017 (arXiv:1706.03741), section 2.2.3.
+    """
+    margin, certain, by_chance = first - second, jnp.log1p(-error_rate), jnp.log(0.5 * error_rate)
+    chosen = jnp.logaddexp(certain + jax.nn.log_sigmoid(margin), by_chance)
+    left = jnp.logaddexp(certain + jax.nn.log_sigmoid(-margin), by_chance)
+    return -weighted_mean(p_first * chosen + (1.0 - p_first) * left, weight)
+
+
 def centring_penalty(first: Float[Array, "*B"], second: Float[Array, "*B"], weight: Float[Array, "*B"]) -> Float[Array, ""]:
     """Mean of ``(r_first + r_second)^2``: preferences say nothing of the rewards' level, this draws it to 0. Eisenstein et al. 2023."""
     return weighted_mean(jnp.square(first + second), weight)

@@ -33,14 +33,18 @@ def generalized_advantage(
     done: Bool[Array, "T *B"],
     gamma: Number,
     gae_lambda: Number,
+    turn: Float[Array, "T *B"] | float = 1.0,
 ) -> Float[Array, "T *B"]:
     """Generalised advantage estimates.
 
     ``next_value`` is the value of the *true* successor of each step, so that a time limit bootstraps from the observation the episode was
     cut at: only ``terminated`` removes it, and ``done`` stops the sum. Schulman et al. 2016 (arXiv:1506.02438), eq. 16.
+
+    In a game of two, ``reward`` and ``value`` are those of whoever moves, and ``turn`` is -1 where the successor is seen from the other
+    side, 1 where the same player moves again: what is good for one is bad for the other, along the whole sum.
     """
-    delta = reward + gamma * jnp.where(terminated, 0.0, next_value) - value
-    carry_on = jnp.where(done, 0.0, gamma * gae_lambda)
+    delta = reward + gamma * turn * jnp.where(terminated, 0.0, next_value) - value
+    carry_on = jnp.where(done, 0.0, gamma * gae_lambda * turn)
 
     def backward(following: Float[Array, "*B"], row: tuple[Array, Array]) -> tuple[Array, Array]:
         delta_t, carry_on_t = row

@@ -60,9 +60,9 @@ class AgainstOpponent(gymnasium.Env):
         if seed is not None:
             self._begun = 0
         if self._begun % 2 == 0:
-            self._opening, self._agent = self._seed(), int(self.np_random.integers(2))
+            self._opening, self._agent = self._seed(), int(self.np_random.integers(self._game.num_players))
         else:
-            self._agent = 1 - self._agent
+            self._agent = self._game.num_players - 1 - self._agent
         self._begun += 1
         self._position, obs, _, _ = self._reply(self._begin(self._opening), np.int32(self._agent), self._seed())
         return jax.tree.map(np.asarray, obs), {}

@@ -1,9 +1,11 @@
 """A trained policy as a player: searches with its network from the position, or plays the network's best move where it cannot search."""
 
+import hashlib
 from collections.abc import Callable, Mapping
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Key, PyTree
 
 from thorndike.errors import UserError
@@ -34,7 +36,7 @@ def agent_player(
     an algorithm whose policy does not tell probabilities of moves.
     """
     if algorithm.probabilities is None:
-        raise UserError(f"{name} tells no probabilities of moves, so it cannot play here: train it with alphazero, or with ppo")
+        raise UserError(f"{name} tells no probabilities of moves, so it cannot play here: train it with alphazero, muzero or ppo")
     evaluate = _evaluation(game, algorithm, algorithm.probabilities, wrapper, statistics)
     settings = _settings(config, max(simulations, 1))
     searches = simulations > 0 and game.num_players == 2 and not game.has_chance
@@ -56,7 +58,15 @@ def agent_player(
         of_two = game.num_players == 2 and not game.has_chance
         return Choice(int(action[0]), min(max(float(value[0] + 1) / 2, 0.0), 1.0) if of_two else None)
 
-    return Player(name, choose)
+    return Player(name, choose, identity=fingerprint((actor, statistics)))
+
+
+def fingerprint(tree: PyTree) -> str:
+    """A short text that another tree has another of."""
+    digest = hashlib.sha256()
+    for leaf in jax.tree.leaves(tree):
+        digest.update(np.asarray(leaf).tobytes())
+    return digest.hexdigest()[:16]
 
 
 def _evaluation(game: Game, algorithm: Algorithm, probabilities: Callable, wrapper: Wrapper, statistics: PyTree) -> Evaluate:

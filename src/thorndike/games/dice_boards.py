@@ -2,7 +2,9 @@
 
 from collections.abc import Sequence
 
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from thorndike.games.face import Face
 from thorndike.games.game import Board, Position, Square
@@ -68,6 +70,20 @@ def _backgammon_board(position: Position, legal: Sequence[int]) -> Board:
     return Board(tuple(map(tuple, rows)), ("", ""), upper, clicks, buttons, caption)
 
 
+def _backgammon_seen(position: Position) -> Float[Array, "1 1 203"]:
+    """As Tesauro 1995 ("Temporal difference learning and TD-Gammon") shows a point to a network: whether a lone checker stands there, two,
+    three, and how many more; mine, then theirs. Then the bars, what is home, and the dice that are left."""
+    board = position._board.astype(jnp.float32)
+    sides = jnp.stack([board, -board])
+    points = sides[:, :24]
+    units = [points == 1, points >= 2, points >= 3, jnp.maximum(points - 3.0, 0.0) / 2.0]
+    seen = jnp.stack([unit.astype(jnp.float32) for unit in units], axis=-1).reshape(-1)
+    rest = jnp.concatenate([sides[0, 24:25], sides[1, 25:26], sides[0, 26:27], sides[1, 27:28]]) / jnp.array([2.0, 2.0, 15.0, 15.0])
+    left = position._playable_dice[:, None] == jnp.arange(6)[None]
+    dice = jnp.concatenate([jnp.any(left, axis=0).astype(jnp.float32), jnp.sum(left, dtype=jnp.float32)[None] / 4.0])
+    return jnp.concatenate([seen, rest, dice])[None, None]
+
+
 def _slide_name(position: Position, action: int) -> str:
     return _SLIDES[action]
 
@@ -78,5 +94,5 @@ def _slide_board(position: Position, legal: Sequence[int]) -> Board:
     return Board(rows, ("",) * 4, ("",) * 4, {}, {_SLIDES[action]: action for action in legal})
 
 
-BACKGAMMON = Face(_backgammon_board, _backgammon_name)
+BACKGAMMON = Face(_backgammon_board, _backgammon_name, observe=_backgammon_seen)
 PLAY_2048 = Face(_slide_board, _slide_name)

@@ -35,8 +35,11 @@ Start: TypeAlias = Callable[[], Dialogue]
 """Start the program, and make it ready. Raises ``EngineFailure``, and ``UserError`` where it refuses its settings."""
 
 
-def engine_player(name: str, start: Start) -> Player:
-    """A player that asks the program that ``start`` starts; it runs from its first move on."""
+def engine_player(name: str, start: Start, asked_always: bool = False) -> Player:
+    """A player that asks the program that ``start`` starts; it runs from its first move on.
+
+    With ``asked_always`` it is asked even where one move alone is legal: it plans several at once, and has to see the first.
+    """
     running: list[Dialogue] = []
 
     def close() -> None:
@@ -50,7 +53,7 @@ def engine_player(name: str, start: Start) -> Player:
 
     def choose(turn: Turn) -> Choice:
         legal = np.flatnonzero(np.asarray(turn.game.legal(turn.position)))
-        if len(legal) == 1:
+        if len(legal) == 1 and not asked_always:
             # Othello's engines pass without a word, and do not know how to be asked for it.
             return Choice(int(legal[0]))
         try:

@@ -1,4 +1,4 @@
-"""Programs that nobody here wrote, by short names: ``gnugo:level=3``, ``stockfish:elo=1500``, ``rhino:level=3``, ``fairy:skill=-10``.
+"""Programs that nobody here wrote, by short names: ``gnugo:level=3``, ``stockfish:elo=1500``, ``fairy:skill=-10``.
 
 Any other goes by its command: ``gtp:COMMAND``, ``uci:COMMAND``, ``usi:COMMAND``. Nothing is started before its first move.
 """
@@ -40,6 +40,8 @@ class Engine(NamedTuple):
     """Name -> least and greatest value."""
     start: Callable[[tuple[str, ...], str, Settings, float], "Start"]
     """Program, game, settings, seconds that a move may take -> how to start it."""
+    asked_always: bool = False
+    """Whether it is asked even where one move alone is legal."""
 
 
 def _gnugo(program: tuple[str, ...], game: str, settings: Settings, limit_s: float) -> "Start":
@@ -78,6 +80,13 @@ def _fairy(program: tuple[str, ...], game: str, settings: Settings, limit_s: flo
     return uci_start(program, options, _limit(settings), limit_s, "usi" if "shogi" in game else "uci")
 
 
+def _gnubg(program: tuple[str, ...], game: str, settings: Settings, limit_s: float) -> "Start":
+    from thorndike.games.gnubg import gnubg_start
+
+    # Plain text, without the opening sound and without the user's own settings.
+    return gnubg_start((*program, "--tty", "--quiet", "--no-rc"), settings.get("plies", 0), limit_s)
+
+
 def _limit(settings: Settings) -> Settings:
     return {name: settings[name] for name in _THINKS if name in settings} or _THINKS_BY_DEFAULT
 
@@ -85,6 +94,7 @@ def _limit(settings: Settings) -> Settings:
 ENGINES: Mapping[str, Engine] = MappingProxyType(
     {
         "gnugo": Engine("gnugo", "gnugo", ("go_9x9", "go_19x19"), {"level": (1, 10), "seed": (0, 2**31 - 1)}, _gnugo),
+        "gnubg": Engine("gnubg", "gnubg", ("backgammon",), {"plies": (0, 4)}, _gnubg, asked_always=True),
         "rhino": Engine("gtp-rhino", "grhino", ("othello",), {"level": (1, 5), "random": (0, 10)}, _rhino),
         "stockfish": Engine("stockfish", "stockfish", ("chess",), {"elo": (1350, 2850), "skill": (0, 20), **_THINKS}, _stockfish),
         "fairy": Engine(
@@ -106,7 +116,8 @@ def engine(text: str, game: str) -> "Player":
     """The player of ``NAME[:key=value,...]`` or ``PROTOCOL:COMMAND`` for a game. Raises UserError where there is none, in one line."""
     from thorndike.games.engine_player import engine_player
 
-    return engine_player(text, engine_start(text, game))
+    found = ENGINES.get(text.partition(":")[0])
+    return engine_player(text, engine_start(text, game), asked_always=found is not None and found.asked_always)
 
 
 def check_engine(text: str, game: str) -> None:

@@ -15,10 +15,9 @@ from thorndike.errors import UserError
 from thorndike.games.game import Game, Position
 from thorndike.games.packing import packing
 from thorndike.games.settings import GameSettings
-from thorndike.networks.masking import FORBIDDEN, MASK
+from thorndike.networks.masking import BOARD, FORBIDDEN, MASK, POSITION
 from thorndike.types import Action, Environment, EnvSpec, Noise, Observation, Shared, Step
 
-BOARD, POSITION = "board", "position"
 SELF_PLAY = GameSettings()
 _POOL = 8
 """Games of a batch that share one opening, where they begin at the same step."""
@@ -34,6 +33,11 @@ def observation_space(game: Game) -> gymnasium.spaces.Dict:
             POSITION: spaces.Box(whole.min, whole.max, (packing(game).size,), np.int32),
         }
     )
+
+
+def observes_game(space: gymnasium.Space) -> bool:
+    """Whether observations of this space are positions of a game."""
+    return isinstance(space, spaces.Dict) and set(space.spaces) == {BOARD, MASK, POSITION}
 
 
 def observed_position(game: Game, position: Position) -> Observation:

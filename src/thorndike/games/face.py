@@ -3,6 +3,8 @@
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+from jaxtyping import Array, Float
+
 from thorndike.games.game import Board, Position, Symmetry
 
 
@@ -13,3 +15,5 @@ class Face(NamedTuple):
     """Position and its legal actions -> the board."""
     action_name: Callable[[Position, int], str]
     symmetries: tuple[Symmetry, ...] = ()
+    observe: Callable[[Position], Float[Array, "height width channels"]] | None = None
+    """What the player to move sees, where pgx's own form is hard to learn from."""

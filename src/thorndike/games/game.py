@@ -107,6 +107,8 @@ class Player(NamedTuple):
     """Raises UserError where the player cannot go on (an engine that died twice); a match then counts the game as not played."""
     close: Callable[[], None] = lambda: None
     """Ends what was started. A player is not asked afterwards."""
+    identity: str = ""
+    """What tells a player from an earlier one of the same name: of an agent its parameters, which training on changes."""
 
 
 def named_action(game: Game, position: Position, name: str) -> int | None:

@@ -11,7 +11,7 @@ import numpy as np
 from thorndike.errors import UserError
 from thorndike.games.game import Game, Player, Position, Turn
 from thorndike.games.game_record import GameRecord
-from thorndike.games.match_file import MatchFile, PlayedGame
+from thorndike.games.match_file import IDENTITIES, MatchFile, PlayedGame
 from thorndike.games.tally import Tally, tally
 
 Progress: TypeAlias = Callable[[PlayedGame], None]
@@ -101,7 +101,9 @@ def play_match(
     if game.num_players != 2:
         raise UserError(f"a match is between two players, and {game.id} is played by one")
     rules, names = compiled(game), (players[0].name, players[1].name)
-    facts = {"game": game.id, "players": [*names], "seed": seed, "opening_plies": opening_plies}
+    facts: dict[str, object] = {"game": game.id, "players": [*names], "seed": seed, "opening_plies": opening_plies}
+    if any(player.identity for player in players):
+        facts[IDENTITIES] = [player.identity for player in players]
     file = MatchFile(path, facts)
     done = {played.number: played for played in file.read() if played.number < games}
     begun = itertools.cycle(openings(rules, opening_plies, seed))

@@ -10,6 +10,8 @@ from thorndike.errors import UserError
 from thorndike.training.json_files import TEXT, Kind, check_fields, parse_object, whole
 
 FORMAT = "thorndike-match"
+IDENTITIES = "identities"
+"""The fact that tells two players of one name apart."""
 _SCORE = Kind("1, 0.5 or 0", lambda value: value in (0, 0.5, 1) and not isinstance(value, bool))
 _PAIR = Kind("two short texts", lambda value: isinstance(value, list) and len(value) == 2 and all(map(TEXT.admits, value)))
 
@@ -62,6 +64,10 @@ class MatchFile:
             return []
         found = parse_object(whole_lines[0], path)
         for name, value in self._facts.items():
+            if name == IDENTITIES and found.get(name) != value:
+                raise UserError(
+                    f"{path} holds games of a run that has been trained on since, or changed: keep the new ones in another folder"
+                )
             if found.get(name) != value:
                 raise UserError(f"{path} is of another match: its {name} is {json.dumps(found.get(name))[:60]}, not {json.dumps(value)}")
         if rest:

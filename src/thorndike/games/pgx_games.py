@@ -22,7 +22,6 @@ from thorndike.games.game import Board, Game, Position
 OLDEST, NEWEST = (2, 6), (2, 6)
 """Of pgx: the first and the last minor version that the tests pass with."""
 FACES = {
-    "othello": ("thorndike.games.placing_boards", "OTHELLO"),
     "hex": ("thorndike.games.placing_boards", "HEX"),
     "go_9x9": ("thorndike.games.placing_boards", "GO_9X9"),
     "go_19x19": ("thorndike.games.placing_boards", "GO_19X19"),
@@ -35,7 +34,6 @@ FACES = {
 }
 """Id -> module and attribute of its face."""
 LONGEST = {
-    "othello": 128,  # 60 squares, and less than one pass for each
     "hex": 122,  # 121 squares, and the swap
     "go_9x9": 162,
     "go_19x19": 722,
@@ -95,6 +93,8 @@ def pgx_game(id: str) -> Game:
         return mask & singles
 
     def observe(position: Position) -> Float[Array, "height width channels"]:
+        if face.observe is not None:
+            return face.observe(position)
         with _as_pgx_is_written():
             seen = env._observe(position, position.current_player).astype(jnp.float32)
         return seen if seen.ndim == 3 else seen[None, None]

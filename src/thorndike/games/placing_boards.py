@@ -1,13 +1,12 @@
-"""Boards on which pieces are placed and stay: Othello, Hex and Go."""
+"""Boards on which pieces are placed and stay: Hex and Go."""
 
 from collections.abc import Sequence
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from thorndike.games.face import Face
-from thorndike.games.game import Board, Position, Square, Symmetry
+from thorndike.games.game import Board, Position, Square
+from thorndike.games.turning import turned_board
 
 _LETTERS = "abcdefghijklmnopqrstuvwxyz"
 _GO_LETTERS = "ABCDEFGHJKLMNOPQRSTUVWXYZ"
@@ -15,8 +14,6 @@ _GO_LETTERS = "ABCDEFGHJKLMNOPQRSTUVWXYZ"
 Turns = tuple[tuple[int, bool], ...]
 """Quarter turns, and whether the board is mirrored first."""
 _ALL: Turns = tuple((turns, mirrored) for mirrored in (False, True) for turns in range(4))[1:]
-# A quarter turn of Othello's beginning exchanges the colours: no game of Othello looks like that.
-_OTHELLO: Turns = ((2, False), (1, True), (3, True))
 # Anything but half a turn would exchange the sides that the players connect.
 _HEX: Turns = ((2, False),)
 
@@ -37,26 +34,16 @@ def _placing(size: int, kind: str, extra: str, turns: Turns) -> Face:
     def action_name(position: Position, action: int) -> str:
         return names[action]
 
-    return Face(board, action_name, tuple(_symmetry(size, *turn) for turn in turns))
+    return Face(board, action_name, tuple(turned_board(size, *turn) for turn in turns))
 
 
 def _stones(position: Position, kind: str) -> np.ndarray:
     """Above 0 where player 0 is, below where player 1 is."""
     stones = np.asarray(position._x.board)
-    # Go keeps black's view; the others the mover's.
+    # Go keeps black's view, Hex the mover's.
     return stones if kind == "go" or int(position.current_player) == 0 else -stones
 
 
-def _symmetry(size: int, turns: int, mirrored: bool) -> Symmetry:
-    def turned(squares: Float[Array, "height width channels"]) -> Float[Array, "height width channels"]:
-        return jnp.rot90(squares[:, ::-1] if mirrored else squares, turns)
-
-    numbers = np.arange(size * size).reshape(size, size)
-    actions = np.rot90(numbers[:, ::-1] if mirrored else numbers, turns).reshape(-1)
-    return Symmetry(turned, np.append(actions, size * size))
-
-
-OTHELLO = _placing(8, "othello", "pass", _OTHELLO)
 HEX = _placing(11, "hex", "swap", _HEX)
 GO_9X9 = _placing(9, "go", "pass", _ALL)
 GO_19X19 = _placing(19, "go", "pass", _ALL)

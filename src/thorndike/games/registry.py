@@ -20,12 +20,13 @@ OWN_GAMES: Mapping[str, str] = MappingProxyType(
     {
         "tic_tac_toe": "thorndike.games.tic_tac_toe:TIC_TAC_TOE",
         "connect_four": "thorndike.games.connect_four:CONNECT_FOUR",
+        "othello": "thorndike.games.othello:OTHELLO",
     }
 )
 """Id -> ``module:attribute`` of the game."""
 ADAPTED_GAMES: Mapping[str, str] = MappingProxyType(
     dict.fromkeys(
-        ("othello", "hex", "go_9x9", "go_19x19", "chess", "gardner_chess", "shogi", "animal_shogi", "backgammon", "2048"),
+        ("hex", "go_9x9", "go_19x19", "chess", "gardner_chess", "shogi", "animal_shogi", "backgammon", "2048"),
         "thorndike.games.pgx_games:pgx_game",
     )
 )

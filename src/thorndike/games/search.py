@@ -9,6 +9,7 @@ twice). Below a finished position nothing counts (``discount`` 0), and nothing b
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple, TypeAlias
 
 import jax
@@ -18,6 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from thorndike.errors import UserError
 from thorndike.games.game import Game, Position
+from thorndike.games.tree_loop import Simulations
 from thorndike.networks.masking import FORBIDDEN
 
 SEARCHES = ("gumbel", "puct")
@@ -45,7 +47,7 @@ class SearchSettings(NamedTuple):
     value_scale: float = 0.5
     """Of ``gumbel``: c_scale, the weight of values against the prior; 0.5 is the paper's 1 for values in [0, 1]."""
     rescale_values: bool = False
-    """Of ``gumbel``: stretch the values of a node's moves to [0, 1] first."""
+    """Stretch the values of a node's moves to [0, 1] first: where nobody knows how large values are."""
 
 
 class Found(NamedTuple):
@@ -81,22 +83,46 @@ def search(
     logits, value = evaluate(params, positions, key_root)
     legal = jax.vmap(game.legal)(positions)
     root = mctx.RootFnOutput(prior_logits=jnp.where(legal, logits, FORBIDDEN), value=value, embedding=positions)
-    recurrent = _recurrent(game, evaluate)
-    shared = (params, key_search, root, recurrent, settings.simulations, ~legal)
+    return grow(settings, params, root, _recurrent(game, evaluate), legal, key_search, explore)
+
+
+def grow(
+    settings: SearchSettings,
+    params: PyTree,
+    root: mctx.RootFnOutput,
+    recurrent: mctx.RecurrentFn,
+    legal: Bool[Array, "B actions"],
+    key: Key[Array, ""],
+    explore: bool,
+) -> Found:
+    """Search from ``root``, whatever it is that ``recurrent`` follows: rules, or what a network thinks of them. Consumes the key."""
+    shared = (params, key, root, recurrent, settings.simulations, ~legal)
     if settings.kind == "puct":
+        scaled = mctx.qtransform_by_parent_and_siblings if settings.rescale_values else _scaled_to_unit
+        select = partial(mctx.muzero_action_selection, pb_c_init=settings.c_puct, qtransform=scaled)
         output = mctx.muzero_policy(
             *shared,
-            qtransform=_scaled_to_unit,
+            loop_fn=Simulations(params, recurrent, select, select),
+            qtransform=scaled,
             dirichlet_fraction=settings.dirichlet_fraction if explore else 0.0,
             dirichlet_alpha=settings.dirichlet_alpha,
             pb_c_init=settings.c_puct,
         )
         action = jnp.argmax(output.action_weights, axis=-1)
     else:
+        considered, completed = min(settings.considered_moves, legal.shape[1]), _completed(settings)
+
+        def at_root(key: Key[Array, ""], tree: mctx.Tree, node: Int[Array, ""], depth: Int[Array, ""] | int) -> Int[Array, ""]:
+            del depth
+            counts = {"num_simulations": settings.simulations, "max_num_considered_actions": considered}
+            return mctx.gumbel_muzero_root_action_selection(key, tree, node, **counts, qtransform=completed)
+
+        inside = partial(mctx.gumbel_muzero_interior_action_selection, qtransform=completed)
         output = mctx.gumbel_muzero_policy(
             *shared,
-            qtransform=_completed(settings),
-            max_num_considered_actions=min(settings.considered_moves, game.num_actions),
+            loop_fn=Simulations(params, recurrent, at_root, inside),
+            qtransform=completed,
+            max_num_considered_actions=considered,
             gumbel_scale=1.0 if explore else 0.0,
         )
         action = output.action

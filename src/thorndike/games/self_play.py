@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from thorndike.games.game import Game
 from thorndike.games.packing import packing
@@ -98,9 +98,3 @@ def false_resignations(rows: Rows) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """How many movers of games played on would have resigned, and how many of these did not lose, as shares of all rows."""
     would = rows.resigns & rows.known
     return jnp.mean(would.astype(jnp.float32)), jnp.mean((would & (rows.outcome > -1)).astype(jnp.float32))
-
-
-def players(game: Game, positions: PyTree) -> Int[Array, "T B"]:
-    """Who is to move in packed positions ``[T, B, words]``."""
-    unpack = packing(game).unpack
-    return jax.vmap(jax.vmap(lambda numbers: game.player(unpack(numbers))))(positions)

@@ -15,9 +15,10 @@ from thorndike.language import grpo as groups
 from thorndike.language import ppo as proximal
 from thorndike.language.best_of_n import best, sample_many
 from thorndike.language.comparisons import ComparisonData, comparison_data
+from thorndike.language.json_fields import Dtype
 from thorndike.language.learner import State
 from thorndike.language.lora import LoraConfig
-from thorndike.language.model import LanguageModel, load_model, never_ending, save_model
+from thorndike.language.model import LanguageModel, computing_in, load_model, never_ending, precision, save_model
 from thorndike.language.over_optimisation import Limits
 from thorndike.language.policy_learner import PolicyLearner
 from thorndike.language.policy_training import Outcome, Task, Told, train_policy
@@ -26,7 +27,7 @@ from thorndike.language.reward_files import RewardModel, load_reward_model, norm
 from thorndike.language.reward_model import Config as RewardConfig
 from thorndike.language.reward_model import reward_model
 from thorndike.language.reward_report import HeldOut
-from thorndike.language.reward_training import Log, fit, report_on, scores_of
+from thorndike.language.reward_training import as_one, passes, report_on, scores_of
 from thorndike.language.rewards import Score, model_score, weighted_sum
 from thorndike.language.rollouts import Written, make_prompts
 from thorndike.language.text_run import MODEL, TextOutcome, TextPlan, open_run, run_learner
@@ -82,10 +83,14 @@ def load_rewards(parts: Sequence[Reward], base: LanguageModel) -> Rewards:
 
 def train_reward_model(
     folder: Path, data: Sequence[Path], held_out: Sequence[Path], out: Path, settings: Mapping[str, object], *, members: int = 1,
-    seed: int = 0, lora: LoraConfig | None = None, log: Log | None = None,
-) -> HeldOut:  # fmt: skip
-    """A reward model from files of preferences, in ``out/model``. Without ``held_out`` a tenth of them is kept to measure with."""
-    base = load_model(folder)
+    seed: int = 0, lora: LoraConfig | None = None, dtype: Dtype | None = None, progress: bool = True,
+) -> HeldOut | None:  # fmt: skip
+    """A reward model from files of preferences, in ``out/model``. Without ``held_out`` a tenth of them is kept to measure with.
+
+    Goes on where it stopped; nothing is found if it is interrupted.
+    """
+    plain = load_model(folder)
+    base = computing_in(plain, dtype)
     comparisons = read_comparisons(data, base.tokenizer)
     measured = read_comparisons(held_out, base.tokenizer) if held_out else []
     if not measured:
@@ -97,11 +102,17 @@ def train_reward_model(
     size = min(int(cast(int, settings.get("batch_size", 32))), max(1, len(train.valid)))
     config = configured(RewardConfig, {"total_steps": max(1, len(train.valid) // size), **settings, "batch_size": size})
     request = {"verb": "reward", "model": str(folder.absolute()), "data": [str(path.absolute()) for path in data], "members": members}
-    open_run(out, request | {"held_out": [str(path.absolute()) for path in held_out], "seed": seed, "settings": settings_of(config)})
+    request |= {"held_out": [str(path.absolute()) for path in held_out], "seed": seed, "settings": settings_of(config)}
+    open_run(out, request | precision(dtype) | ({} if lora is None else {"lora": settings_of(lora)}))
     if (out / MODEL).exists():
         return cast(HeldOut, load_reward_model(out / MODEL).held_out)
-    learnt = fit(reward_model(config, base.config, lora), config, base.params, train, members=members, seed=seed, log=log)
-    scored = replace(base.config, num_labels=1)
+    learner = as_one(reward_model(config, base.config, lora), members)
+    plan = TextPlan(config.total_steps, log_every=max(1, config.total_steps // 100), checkpoint_every=max(1, config.total_steps // 5))
+    outcome = run_learner(out, learner, base.params, passes(train, config, members, seed), plan, seed, progress=progress)
+    if outcome.status != "finished":
+        return None
+    learnt = learner.params(outcome.state, base.params)
+    scored = replace(plain.config, num_labels=1)
     found = report_on(scores_of(learnt, scored, test, config.pool).mean(axis=0), test)
     model = RewardModel(scored, tuple(learnt), base.tokenizer, config.pool, held_out=found)
     save_reward_model(normalised(model, _base_samples(base, train, seed)), out / MODEL)
@@ -113,7 +124,7 @@ def train_reward_model(
 
 def align(
     folder: Path, rewards: Sequence[Reward], prompts: Sequence[Path], out: Path, learner: str, settings: Mapping[str, object], *,
-    limits: Limits, lora: LoraConfig | None = None, seed: int = 0, told: Told | None = None,
+    limits: Limits, lora: LoraConfig | None = None, seed: int = 0, dtype: Dtype | None = None, told: Told | None = None,
 ) -> tuple[Outcome, Comparison | None]:  # fmt: skip
     """PPO, GRPO or RLOO into ``out``; its ``model`` is a Hugging Face folder. Goes on where it stopped; no comparison if interrupted.
 
@@ -124,8 +135,9 @@ def align(
         config = configured(proximal.Config, settings)
     else:
         config = configured(groups.Config, {**settings, **({"baseline": "leave_one_out"} if learner == "rloo" else {})})
-    base = load_model(folder)
-    base = never_ending(base) if config.ignore_eos else base
+    plain = load_model(folder)
+    plain = never_ending(plain) if config.ignore_eos else plain
+    base = computing_in(plain, dtype)
     reward = load_rewards(rewards, base)
     built: PolicyLearner
     if isinstance(config, proximal.Config):
@@ -138,7 +150,7 @@ def align(
     open_run(out, {
         "verb": learner, "model": str(folder.absolute()), "rewards": [list(each) for each in rewards], "seed": seed,
         "prompts": [str(path.absolute()) for path in prompts], "settings": settings_of(config), "limits": settings_of(limits),
-        "lora": None if lora is None else settings_of(lora),
+        "lora": None if lora is None else settings_of(lora), **precision(dtype),
     })  # fmt: skip
     task = Task(base, train, reward.score, _members(reward))
     outcome = train_policy(task, built, config, out, seed=seed, limits=limits, told=told)
@@ -155,23 +167,24 @@ def align(
     )
     write_json(out / "comparison.json", as_json(found))
     if not (out / MODEL).exists():
-        save_model(base._replace(params=outcome.params), out / MODEL)
+        save_model(plain._replace(params=outcome.params), out / MODEL)
     return outcome, found
 
 
 def align_by_preferences(
     folder: Path, data: Sequence[Path], out: Path, settings: Mapping[str, object], *, lora: LoraConfig | None = None, seed: int = 0,
-    progress: bool = True,
+    dtype: Dtype | None = None, progress: bool = True,
 ) -> TextOutcome:  # fmt: skip
     """DPO into ``out``; its ``model`` is a Hugging Face folder. Goes on where it stopped."""
-    base = load_model(folder)
+    plain = load_model(folder)
+    base = computing_in(plain, dtype)
     comparisons = comparison_data(read_comparisons(data, base.tokenizer), base.tokenizer.pad_id)
     rows = len(comparisons.valid)
     size = min(int(cast(int, settings.get("batch_size", 32))), rows)
     config = configured(direct.Config, {"total_steps": max(1, rows // size), **settings, "batch_size": size})
     open_run(out, {
         "verb": "dpo", "model": str(folder.absolute()), "data": [str(path.absolute()) for path in data], "seed": seed,
-        "settings": settings_of(config), "lora": None if lora is None else settings_of(lora),
+        "settings": settings_of(config), "lora": None if lora is None else settings_of(lora), **precision(dtype),
     })  # fmt: skip
     reference = direct.reference_log_probs(base.params, base.config, comparisons)
     learner, per_pass = direct.dpo(config, base.config, lora), rows // size
@@ -184,7 +197,7 @@ def align_by_preferences(
     plan = TextPlan(config.total_steps, log_every=max(1, config.total_steps // 100), checkpoint_every=max(1, config.total_steps // 5))
     outcome = run_learner(out, learner, base.params, batch, plan, seed, progress=progress)
     if outcome.status == "finished" and not (out / MODEL).exists():
-        save_model(base._replace(params=learner.params(outcome.state, learner.frozen(base.params))), out / MODEL)
+        save_model(plain._replace(params=learner.params(outcome.state, learner.frozen(base.params))), out / MODEL)
     return outcome
 
 

@@ -29,6 +29,7 @@ from thorndike.language.learner import Learner, State, accumulated, adamw, desce
 from thorndike.language.lora import LoraConfig
 from thorndike.language.model_config import ModelConfig
 from thorndike.settings import AtLeast, Between, MoreThan, OneOf, check
+from thorndike.training.devices import rows_shared
 from thorndike.types import Metrics
 
 
@@ -134,5 +135,5 @@ def reference_log_probs(params: Params, config: ModelConfig, data: ComparisonDat
     parts = []
     for start in range(0, rows, batch_size):
         numbers: Int[np.ndarray, " n"] = np.minimum(np.arange(start, start + batch_size), rows - 1)
-        parts.append(np.asarray(compute(params, data.rows(numbers))))
+        parts.append(np.asarray(compute(params, rows_shared(data.rows(numbers)))))
     return np.concatenate(parts)[:rows]

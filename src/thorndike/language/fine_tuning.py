@@ -7,9 +7,10 @@ import jax
 
 from thorndike.errors import UserError
 from thorndike.language.data import read_rows, tokenize
+from thorndike.language.json_fields import Dtype
 from thorndike.language.learner import State
 from thorndike.language.lora import Adapter, LoraConfig, save_adapter
-from thorndike.language.model import LanguageModel, load_model, save_model
+from thorndike.language.model import LanguageModel, computing_in, load_model, precision, save_model
 from thorndike.language.packing import PackedRows, batch_at, packed
 from thorndike.language.pretraining import held_out_loss
 from thorndike.language.sft import Config, TextBatch, sft
@@ -28,13 +29,15 @@ def fine_tune(
     lora: LoraConfig | None = None,
     held_out: Sequence[Path] = (),
     seed: int = 0,
+    dtype: Dtype | None = None,
     progress: bool = True,
 ) -> TextOutcome:
     """Learn from files of rows into a run's directory: its ``model`` loads in transformers, its ``adapter`` (with ``lora``) in PEFT.
 
     Goes on where it stopped. Raises ``UserError`` for rows that nothing can be learnt from, naming file and row.
     """
-    model = load_model(folder)
+    plain = load_model(folder)
+    model = computing_in(plain, dtype)
     request = {
         "verb": "sft",
         "model": str(folder.absolute()),
@@ -43,6 +46,7 @@ def fine_tune(
         "seed": seed,
         "settings": settings_of(config),
         "lora": None if lora is None else settings_of(lora),
+        **precision(dtype),
     }
     length = min(config.max_length, model.config.max_positions)
     rows = _rows(data, model, length)
@@ -64,7 +68,7 @@ def fine_tune(
     if outcome.status == "finished" and not (out / MODEL).exists():
         if lora is not None:
             save_adapter(Adapter(lora, outcome.state.trained), model.config, out / ADAPTER, str(folder.absolute()))
-        save_model(model._replace(params=learner.params(outcome.state, frozen)), out / MODEL)
+        save_model(plain._replace(params=learner.params(outcome.state, frozen)), out / MODEL)
     return outcome
 
 

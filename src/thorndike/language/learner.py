@@ -1,7 +1,8 @@
 """What every learner of a language model is: a few pure functions on a state. The batches come from elsewhere.
 
 A step of gradient descent may be taken over several parts of a batch, one after the other (gradient accumulation): the loss is divided by
-the weight of the *whole* batch, so that it is the same step whatever the parts are.
+the weight of the *whole* batch, so that it is the same step whatever the parts are. Where several devices share rows
+(training/devices.py), each reads its share of every part, and all have the sum of their gradients.
 """
 
 from collections.abc import Callable
@@ -16,6 +17,7 @@ from thorndike.functional.schedules import schedule
 from thorndike.language.decoder import Params
 from thorndike.language.lora import Adapter, LoraConfig, initial_adapter, merged
 from thorndike.language.model_config import ModelConfig
+from thorndike.training.devices import rows_shared, same_everywhere
 from thorndike.types import Metrics
 
 
@@ -97,11 +99,11 @@ def accumulated(
     """The gradient of ``loss(trained, part)`` and its metrics, summed over so many equal parts of a batch's first axis."""
     gradient_of = jax.grad(loss, has_aux=True)
     if parts == 1:
-        return gradient_of(trained, batch)
+        return same_everywhere(gradient_of(trained, rows_shared(batch)))
     cut = jax.tree.map(lambda leaf: leaf.reshape(parts, -1, *leaf.shape[1:]), batch)
 
     def add(total: tuple[PyTree, Metrics], part: PyTree) -> tuple[tuple[PyTree, Metrics], None]:
-        return jax.tree.map(jnp.add, total, gradient_of(trained, part)), None
+        return jax.tree.map(jnp.add, total, same_everywhere(gradient_of(trained, rows_shared(part)))), None
 
     shapes = jax.eval_shape(gradient_of, trained, jax.tree.map(lambda leaf: leaf[0], cut))
     nothing = jax.tree.map(lambda shape: jnp.zeros(shape.shape, shape.dtype), shapes)

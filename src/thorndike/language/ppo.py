@@ -156,7 +156,7 @@ def ppo(
 
     def values(learnt: PyTree, rollout: Rollout) -> Float[Array, "B N"]:
         number = rollout.valid.shape[1]
-        return token_values(learnt["value"], value_config, rollout.tokens, rollout.segments)[:, -number - 1 : -1]
+        return token_values(learnt["value"], value_config, rollout.tokens, rollout.segments, config.remat)[:, -number - 1 : -1]
 
     @partial(jax.jit, donate_argnums=0)
     def update(

@@ -48,6 +48,7 @@ class Config:
     center_rewards_coefficient: Annotated[float, AtLeast(0)] = 0.01  # weight of (r_a + r_b)^2
     label_smoothing: Annotated[float, Between(0, 0.5)] = 0.0  # labels are drawn this far towards their opposite
     max_grad_norm: Annotated[float, MoreThan(0)] = 1.0  # a longer gradient is made this long
+    remat: bool = False  # compute activations again in the backward pass: less memory, a third more time
 
     def __post_init__(self) -> None:
         check(self)
@@ -60,11 +61,11 @@ def rate_by_width(hidden_size: int) -> str:
     return f"linear({HELD_LEARNING_RATE * (128 / hidden_size) ** 1.5:.3g}, 0)"
 
 
-def score_batch(params: Params, config: ModelConfig, batch: ComparisonBatch, pool: str) -> Float[Array, "R K"]:
+def score_batch(params: Params, config: ModelConfig, batch: ComparisonBatch, pool: str, remat: bool = False) -> Float[Array, "R K"]:
     """The reward of every text; of padding, a number without meaning."""
     rows, texts, width = batch.tokens.shape
     tokens, segments = batch.tokens.reshape(-1, width), batch.segments.reshape(-1, width)
-    return text_scores(params, config, tokens, segments, "mean" if pool == "mean" else "last").reshape(rows, texts)
+    return text_scores(params, config, tokens, segments, "mean" if pool == "mean" else "last", remat).reshape(rows, texts)
 
 
 def comparison_loss(scores: Float[Array, "R K"], batch: ComparisonBatch, config: Config) -> tuple[Float[Array, ""], Metrics]:
@@ -107,7 +108,7 @@ def reward_model(config: Config, model_config: ModelConfig, lora: LoraConfig | N
 
     def update(state: State, frozen: Params, batch: ComparisonBatch) -> tuple[State, Metrics]:
         def loss(learnt: Params, part: ComparisonBatch) -> tuple[Float[Array, ""], Metrics]:
-            scores = score_batch(params_of(learnt, frozen), model_config, part, config.pool)
+            scores = score_batch(params_of(learnt, frozen), model_config, part, config.pool, config.remat)
             found, metrics = comparison_loss(scores, part, config)
             # The sums of all parts are what the whole batch gives, however its weight is spread.
             share = jnp.sum(part.weight) / jnp.maximum(jnp.sum(batch.weight), 1e-8)

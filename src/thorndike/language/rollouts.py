@@ -21,6 +21,7 @@ from thorndike.language.generation import Generated, Sampling, generate, left_pa
 from thorndike.language.model_config import ModelConfig
 from thorndike.language.rewards import Score, checked_scores
 from thorndike.language.tokenizer import Tokenizer
+from thorndike.training.devices import rows_shared
 from thorndike.types import Metrics
 
 
@@ -80,7 +81,7 @@ def sample_rollout(
     temperature: float, stop_tokens: Sequence[int], pad_id: int, samples: int = 1,
 ) -> Rollout:  # fmt: skip
     """Completions of some prompts, ``samples`` of each side by side. Consumes the key."""
-    tokens, segments = jnp.asarray(prompts.tokens[rows]), jnp.asarray(prompts.segments[rows])
+    tokens, segments = rows_shared((jnp.asarray(prompts.tokens[rows]), jnp.asarray(prompts.segments[rows])))
     found = generate(
         params, config, tokens, segments, key, max_new_tokens=max_new_tokens, sampling=Sampling(temperature), stop_tokens=stop_tokens,
         samples=samples, pad_id=pad_id,

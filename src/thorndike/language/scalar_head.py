@@ -28,16 +28,18 @@ def with_scalar_head(params: Params, config: ModelConfig, key: Key[Array, ""], z
     return kept | {"score": {"kernel": kernel.astype(jnp.dtype(config.dtype))}}, replace(config, num_labels=1)
 
 
-def token_values(params: Params, config: ModelConfig, tokens: Int[Array, "B T"], segments: Int[Array, "B T"]) -> Float[Array, "B T"]:
+def token_values(
+    params: Params, config: ModelConfig, tokens: Int[Array, "B T"], segments: Int[Array, "B T"], remat: bool = False
+) -> Float[Array, "B T"]:
     """The head's number at every token."""
-    return _scored(params, hidden_states(params, config, tokens, segments))
+    return _scored(params, hidden_states(params, config, tokens, segments, remat))
 
 
 def text_scores(
-    params: Params, config: ModelConfig, tokens: Int[Array, "B T"], segments: Int[Array, "B T"], pool: Pool = "last"
+    params: Params, config: ModelConfig, tokens: Int[Array, "B T"], segments: Int[Array, "B T"], pool: Pool = "last", remat: bool = False
 ) -> Float[Array, " B"]:
     """One number a text, padded on either side with segment 0."""
-    hidden, real = hidden_states(params, config, tokens, segments), segments > 0
+    hidden, real = hidden_states(params, config, tokens, segments, remat), segments > 0
     if pool == "mean":
         weights = real.astype(jnp.float32) / jnp.maximum(jnp.sum(real, axis=1, keepdims=True), 1)
         return _scored(params, jnp.einsum("btd,bt->bd", hidden.astype(jnp.float32), weights))

@@ -9,8 +9,8 @@ from thorndike.networks.convolution import Convolution, max_pool
 from thorndike.networks.dense import dense
 from thorndike.networks.hidden_layers import SHOWN
 
-CNNS = ("nature", "impala")
-"""The choices of a ``cnn`` setting."""
+CNNS = ("nature", "impala", "none")
+"""The choices of a ``cnn`` setting. ``none``: pixels go straight to the dense layers, where convolutions cost more than they find."""
 
 LARGE_IMAGE = 36
 """Pixels of the shorter side from which Mnih et al.'s three convolutions fit."""

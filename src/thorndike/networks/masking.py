@@ -17,6 +17,8 @@ from thorndike.networks.network import Network, with_outputs
 from thorndike.types import EnvSpec, Observation
 
 MASK = "action_mask"
+BOARD, POSITION = "board", "position"
+"""The other entries of a game's observation: what a player sees, and all there is, from which to search."""
 FORBIDDEN = -1e9
 """In place of minus infinity, whose gradients are no numbers."""
 
@@ -34,11 +36,18 @@ def without_mask(space: gymnasium.Space) -> gymnasium.Space:
     return next(iter(rest.values())) if len(rest) == 1 else spaces.Dict(rest)
 
 
+def without_position(space: gymnasium.Space) -> gymnasium.Space:
+    """The space less the whole position, where it is a game's: for a search, and not for a network."""
+    if not isinstance(space, spaces.Dict) or space.spaces.keys() != {BOARD, MASK, POSITION}:
+        return space
+    return spaces.Dict({name: part for name, part in space.spaces.items() if name != POSITION})
+
+
 def observed(space: gymnasium.Space, obs: Observation) -> Observation:
     """The part of ``obs`` that ``without_mask(space)`` describes."""
-    if not has_mask(space):
+    if not isinstance(space, spaces.Dict) or MASK not in space.spaces:
         return obs
-    rest = {name: part for name, part in obs.items() if name != MASK}
+    rest = {name: obs[name] for name in space.spaces if name != MASK}
     return next(iter(rest.values())) if len(rest) == 1 else rest
 
 

@@ -13,7 +13,7 @@ from thorndike.errors import UserError
 from thorndike.networks.cnn import CNN
 from thorndike.networks.dense import dense
 from thorndike.networks.hidden_layers import SHOWN
-from thorndike.networks.masking import observed, without_mask
+from thorndike.networks.masking import observed, without_mask, without_position
 from thorndike.types import Observation
 
 ACTIVATIONS: dict[str, Callable[[Array], Array]] = {"tanh": nn.tanh, "relu": nn.relu, "gelu": nn.gelu, "silu": nn.silu}
@@ -59,14 +59,18 @@ class Torso(nn.Module):
     @nn.compact
     def __call__(self, obs: Observation) -> Float[Array, "B G"]:
         """Observation ``[B, ...]`` to features ``[B, G]``."""
-        space, obs = without_mask(self.space), observed(self.space, obs)
-        if not is_image(space):
+        seen = without_position(self.space)
+        space, obs = without_mask(seen), observed(seen, obs)
+        # A game's board has the form of an image, but is small, and every square of it counts.
+        if not is_image(self.space):
             return MLP(self.hidden, self.activation, self.kernel_init, layer_norm=self.layer_norm)(flatten_observation(space, obs))
         # A trailing axis turns a grey image [B, H, W] into [B, H, W, 1].
         image = obs if obs.ndim == 4 else obs[..., None]
         if is_channels_first(space):
             image = jnp.moveaxis(image, 1, -1)
         scaled = image.astype(jnp.float32) / (255.0 if image.dtype == jnp.uint8 else 1.0)
+        if self.cnn == "none":
+            return MLP(self.hidden, self.activation, self.kernel_init, layer_norm=self.layer_norm)(scaled.reshape(scaled.shape[0], -1))
         return CNN(self.hidden or (128,), self.kernel_init, self.layer_norm, self.cnn)(scaled)
 
 

@@ -14,7 +14,8 @@ class ReplayBuffer(NamedTuple):
     """The ring. Rows ``[N, B]`` are stored flat, ``[N * B, ...]``, row ``t * B + b``."""
 
     rows: PyTree
-    """obs, action, reward, next_obs, terminated, done, valid, the memory an action was chosen with, ensemble's mask: ``[N * B, ...]``."""
+    """obs, action, reward, next_obs, terminated, done, valid, the memory an action was chosen with, ensemble's mask, what a search found:
+    ``[N * B, ...]``."""
     position: Int[Array, ""]
     """The step written next, in ``[0, N)``."""
     size: Int[Array, ""]
@@ -37,10 +38,10 @@ class Transitions(NamedTuple):
     """Which members of an ensemble learn from it, where one stored that."""
 
 
-def row_shapes(spec: EnvSpec, memory: PyTree = (), mask: PyTree = ()) -> PyTree:
+def row_shapes(spec: EnvSpec, memory: PyTree = (), mask: PyTree = (), search: PyTree = ()) -> PyTree:
     """One stored transition of an environment, as shapes and dtypes; ``memory`` is a recurrent state of one environment ``[1, ...]``.
 
-    ``mask`` is the shape of an ensemble's bootstrap mask, where there is one.
+    ``mask`` is the shape of an ensemble's bootstrap mask, ``search`` that of what a search found, where there is one.
     """
     obs, action = (
         jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, jnp.asarray(x).dtype), space.sample())
@@ -49,7 +50,7 @@ def row_shapes(spec: EnvSpec, memory: PyTree = (), mask: PyTree = ()) -> PyTree:
     flag, number = jax.ShapeDtypeStruct((), jnp.bool_), jax.ShapeDtypeStruct((), jnp.float32)
     remembered = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), memory)
     row = {"obs": obs, "action": action, "reward": number, "next_obs": obs, "terminated": flag, "done": flag, "valid": flag}
-    return row | {"memory": remembered, "mask": mask}
+    return row | {"memory": remembered, "mask": mask, "search": search}
 
 
 def init_replay(row: PyTree, steps: int, num_envs: int) -> ReplayBuffer:
@@ -71,6 +72,7 @@ def rows_of(rollout: Rollout) -> PyTree:
         "valid": step.valid,
         "memory": extras.get("memory", ()),
         "mask": extras.get("mask", ()),
+        "search": extras.get("search", ()),
     }
 
 

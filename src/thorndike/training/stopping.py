@@ -68,16 +68,18 @@ def prompt_exit() -> Iterator[None]:
         return
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
-    before, woken = signal.getsignal(signal.SIGTERM), signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
-    if before is signal.SIG_DFL:
-        signal.signal(signal.SIGTERM, _unwind)
+    before, woken = {number: signal.getsignal(number) for number in SIGNALS}, signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
+    for number, handler in before.items():
+        if handler in (signal.SIG_DFL, signal.default_int_handler):
+            signal.signal(number, _unwind)
     watch = threading.Thread(target=_watch, args=(reader,), daemon=True, name="signals")
     watch.start()
     try:
         yield
     finally:
         signal.set_wakeup_fd(woken)
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
         os.close(writer)
         watch.join()
         os.close(reader)
@@ -93,13 +95,29 @@ def leave(status: int) -> NoReturn:
         for child in sys.modules["multiprocessing"].active_children():
             child.kill()
     for stream in (sys.stdout, sys.stderr):
-        with suppress(OSError, ValueError):
+        # The last: where a handler has come in the middle of another flush.
+        with suppress(OSError, ValueError, RuntimeError):
             stream.flush()
     os._exit(status)
 
 
 def _unwind(number: int, frame: FrameType | None) -> None:
+    if _is_importing(frame):
+        # Compiled modules do not survive an exception in the middle of their import: it ended 2 of 8 commands by signal 6 or 11. Nothing
+        # that was begun needs to be put in order there.
+        os.write(2, f"thorndike: {'terminated' if number == signal.SIGTERM else 'interrupted'}\n".encode())
+        leave(128 + number)
+    if number == signal.SIGINT:
+        raise KeyboardInterrupt
     raise Terminated(128 + number)
+
+
+def _is_importing(frame: FrameType | None) -> bool:
+    while frame is not None:
+        if frame.f_code.co_filename.startswith("<frozen importlib"):
+            return True
+        frame = frame.f_back
+    return False
 
 
 def _watch(reader: int) -> None:

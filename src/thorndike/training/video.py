@@ -26,30 +26,32 @@ def film(policy: Policy, make: Callable[[str], gymnasium.Env], path: Path | None
             memory, done = None, False
             while not done:
                 if path is not None:
-                    frames.append(_frame(environment))
+                    frames.append(frame_of(environment))
                 action, memory = policy.predict(obs, memory)
                 obs, _, terminated, truncated, _ = environment.step(_plain(environment.action_space, action))
                 done = terminated or truncated
             if path is not None:
-                frames.append(_frame(environment))
+                frames.append(frame_of(environment))
         fps = int(environment.metadata.get("render_fps") or _FPS)
     finally:
         environment.close()
-    return None if path is None else _write(frames, path, fps)
+    return None if path is None else write_film(frames, path, fps)
 
 
 def _plain(space: gymnasium.Space, action: np.ndarray) -> int | np.ndarray:
     return int(action) if isinstance(space, gymnasium.spaces.Discrete) else np.asarray(action, space.dtype)
 
 
-def _frame(environment: gymnasium.Env) -> np.ndarray:
+def frame_of(environment: gymnasium.Env) -> np.ndarray:
+    """What an environment draws. Raises ``UserError`` if it is no picture."""
     frame = environment.render()
     if not isinstance(frame, np.ndarray):
         raise UserError("this environment cannot be filmed: render() with render_mode='rgb_array' must give an array [height, width, 3]")
     return frame
 
 
-def _write(frames: list[np.ndarray], path: Path, fps: int) -> Path:
+def write_film(frames: list[np.ndarray], path: Path, fps: int) -> Path:
+    """Pictures ``[height, width, 3]`` as an mp4. Raises ``UserError`` if the package that writes it is missing."""
     try:
         from imageio_ffmpeg import write_frames
     except ImportError:

@@ -1,7 +1,10 @@
 """The first page: the games there are, those being played, and a saved one to open."""
 
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 from urllib.parse import quote
 
+from fastapi import FastAPI
 from nicegui import run, ui
 
 from thorndike.games.saved_game import LARGEST
@@ -13,7 +16,18 @@ from thorndike.web.setup_form import SetupForm
 from thorndike.web.studio import Place, Setup, Studio
 
 
-def add_home(studio: Studio) -> None:
+class Door(NamedTuple):
+    """Pages that are no part of the studio, behind its gate all the same."""
+
+    title: str
+    line: str
+    """What is there."""
+    address: str
+    add: Callable[[FastAPI], None]
+    """Puts the pages into the studio's app."""
+
+
+def add_home(studio: Studio, doors: Sequence[Door] = ()) -> None:
     """The pages ``/`` and ``/new/GAME``."""
 
     @ui.page("/")
@@ -44,6 +58,13 @@ def add_home(studio: Studio) -> None:
                     for name, summary in being_played.items():
                         with Tag("li"):
                             link(summary, f"/play/{name}")
+            if doors:
+                Tag("h2", "", "Beside the games")
+                with Tag("ul", "rows"):
+                    for door in doors:
+                        with Tag("li"):
+                            link(door.title, door.address)
+                            Tag("span", "quiet", f" {door.line}")
             Tag("h2", "", "A saved game")
             Tag("p", "quiet", "Step through it, or go on from any of its moves.")
             open_file("Open a file…", ".json,application/json", LARGEST, opened)

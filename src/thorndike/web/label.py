@@ -4,6 +4,7 @@ The page keeps what was not acknowledged and sends it again, under the same name
 made a candidate; even a clip's file is asked for by its place on the page.
 """
 
+from html import escape
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -19,6 +20,7 @@ from thorndike.language.preferences.judgements import Content, Shown
 from thorndike.language.preferences.store import Store
 
 STATIC = Path(__file__).parent / "static"
+_BRAND = '<span class="brand">Thorndike</span>'
 _MOST_AT_ONCE = 20
 _LARGEST = 2**31 - 1
 """Number of a row, in PostgreSQL."""
@@ -62,11 +64,13 @@ class _Undoing(BaseModel):
     request: str
 
 
-def add_label_page(app: FastAPI, labelling: Labelling) -> None:
-    """The page ``/label`` and what it asks for below it."""
+def add_label_page(app: FastAPI, labelling: Labelling, home: str = "") -> None:
+    """The page ``/label`` and what it asks for below it; its heading leads to ``home``, if that is given."""
     store, project = labelling.store, labelling.project
     app.mount("/label/static", StaticFiles(directory=STATIC), name="label-static")
     page = (STATIC / "label.html").read_text()
+    if home:
+        page = page.replace(_BRAND, f'<a class="brand" href="{escape(home)}" aria-label="Thorndike, the studio: home">Thorndike</a>')
 
     @app.get("/label")
     def label() -> Response:

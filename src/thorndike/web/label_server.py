@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 from fastapi import FastAPI
 
+from thorndike.web.home import Door
 from thorndike.web.label import Labelling, add_label_page
 from thorndike.web.label_report import add_label_report
 from thorndike.web.server import serve_app
@@ -21,3 +22,14 @@ def serve_labelling(
     serve_app(
         app, host, port, lambda root, shown: told(f"{root}/label?token={shown}", f"{root}/preferences?key={owner_key}&token={shown}"), token
     )
+
+
+def doors_to(labelling: Labelling, key: str | None = None) -> tuple[Door, ...]:
+    """The same two pages for the studio, whose owner is the owner of the judgements, too."""
+    owner_key = key or secrets.token_urlsafe(24)
+    what = f"Judge {labelling.name}" if labelling.name != "default" else "Judge"
+    return (
+        Door(what, "say which of two answers, or clips, is better", "/label", lambda app: add_label_page(app, labelling, home="/")),
+        Door("Judgements", "how far they are, and what they are worth", f"/preferences?key={owner_key}",
+             lambda app: add_label_report(app, labelling, owner_key)),
+    )  # fmt: skip

@@ -4,13 +4,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
-from thorndike.cli.find_run import all_runs, read_facts
 from thorndike.errors import UserError
 from thorndike.games.engines import ENGINES, program_of
 from thorndike.games.game import Game, Player
 from thorndike.games.registry import FOR_ONE, WITH_DICE
 from thorndike.games.registry import game as find_game
 from thorndike.games.trained import trained_run
+from thorndike.training.run_listing import all_runs, read_facts
 from thorndike.user_code import lasting_name
 
 PERSON = "person"
@@ -38,7 +38,7 @@ ANOTHER_PERSON = Opponent(PERSON, "Another person, here", None)
 ALONE = Opponent(PERSON, "Nobody: one plays alone", None)
 _LONG = ("chess", "shogi", "go_19x19")
 """Games that take a search minutes to play out at random as often as it must."""
-_ENGINE_NAMES = {"gnugo": "GNU Go", "rhino": "grhino", "stockfish": "Stockfish", "fairy": "Fairy-Stockfish"}
+_ENGINE_NAMES = {"gnugo": "GNU Go", "gnubg": "GNU Backgammon", "rhino": "grhino", "stockfish": "Stockfish", "fairy": "Fairy-Stockfish"}
 
 
 def is_for_one(game_id: str) -> bool:

@@ -14,7 +14,7 @@ from thorndike.errors import UserError
 from thorndike.web.board import add_board
 from thorndike.web.frame import serve_static_files
 from thorndike.web.gate import Gate
-from thorndike.web.home import add_home
+from thorndike.web.home import Door, add_home
 from thorndike.web.opponents import Opponents
 from thorndike.web.studio import Studio
 
@@ -23,14 +23,22 @@ _RECONNECT_S = 30.0
 _GRACEFUL_S = 1
 
 
-def serve(games: Sequence[str], opponents: Opponents, host: str, port: int, told: Callable[[str], None], token: str | None = None) -> None:
+def serve(
+    games: Sequence[str],
+    opponents: Opponents,
+    host: str,
+    port: int,
+    told: Callable[[str], None],
+    token: str | None = None,
+    doors: Sequence[Door] = (),
+) -> None:
     """Serve until the process is asked to stop. ``told`` gets the address, token included, as soon as it answers.
 
     Raises UserError where the address cannot be had. One studio a process: NiceGUI has one app.
     """
     studio = Studio(games, opponents)
     try:
-        serve_app(_pages(studio), host, port, lambda root, token: told(f"{root}/?token={token}"), token)
+        serve_app(_pages(studio, doors), host, port, lambda root, token: told(f"{root}/?token={token}"), token)
     finally:
         studio.close()
 
@@ -56,10 +64,12 @@ def serve_app(app: FastAPI, host: str, port: int, told: Callable[[str, str], Non
             bound.close()
 
 
-def _pages(studio: Studio) -> FastAPI:
+def _pages(studio: Studio, doors: Sequence[Door]) -> FastAPI:
     app = FastAPI(openapi_url=None, docs_url=None, redoc_url=None)
+    for door in doors:
+        door.add(app)
     serve_static_files()
-    add_home(studio)
+    add_home(studio, doors)
     add_board(studio)
     core.app.config.socket_io_js_transports = ["websocket", "polling"]
     ui.run_with(

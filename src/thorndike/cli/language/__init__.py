@@ -15,6 +15,7 @@ LANGUAGE_VERBS = {
     "sft": "fine-tune a model on texts, prompts with completions, or conversations",
     "import": "put preferences, or candidates to be compared, into a store",
     "label": "a page on which people say which answer, or which clip, is better",
+    "ask": "ask first what an ensemble of reward models disagrees about",
     "agree": "how far raters agree, and how far each can be trusted",
     "export": "a store's preferences as a file that TRL's trainers read",
     "reward": "a reward model from preferences, and how far it can be trusted",

@@ -6,7 +6,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from thorndike.cli.answer import Answer
-from thorndike.cli.language.arguments import add_device_argument, add_settings_argument, given_settings, prepare_device, settings_in_words
+from thorndike.cli.language.arguments import (
+    add_device_argument,
+    add_precision_arguments,
+    add_settings_argument,
+    given_settings,
+    prepare_device,
+    settings_in_words,
+    sharing,
+)
+from thorndike.cli.language.config_file import parse_with_config
 from thorndike.cli.parser import Parser, positive_whole, seed_number
 from thorndike.errors import UserError
 
@@ -28,6 +37,7 @@ def add_training_arguments(parser: Parser) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="the run's folder; its model/ is a Hugging Face folder")
     parser.add_argument("--lora", type=positive_whole, metavar="RANK", help="learn an adapter of this rank instead of all parameters")
     add_settings_argument(parser)
+    add_precision_arguments(parser)
     parser.add_argument("--seed", type=seed_number, default=0, help="the number everything random follows from (default: 0)")
     add_device_argument(parser)
 
@@ -53,13 +63,13 @@ def run_policy_verb(verb: str, summary: str, words: Sequence[str]) -> Answer:
     add_training_arguments(parser)
     parser.add_argument("--reward", action="append", required=True, metavar="WHAT", help="WHAT or WEIGHT*WHAT; several are summed")
     parser.add_argument("--prompts", type=Path, action="append", required=True, metavar="FILE", help="rows with a column prompt")
-    parser.add_argument("--max-kl", type=_positive, metavar="NATS", help="stop beyond, and keep the last policy that was not")
+    parser.add_argument("--max-kl", type=above_zero, metavar="NATS", help="stop beyond, and keep the last policy that was not")
     parser.add_argument("--no-limits", action="store_true", help="do not stop on disagreement, repetition or changed length either")
-    options = parser.parse(words)
+    options = parse_with_config(parser, words, verb, module)
     settings = given_settings(options.settings, module)
     if verb == "rloo" and "baseline" in settings:
         raise UserError("rloo is GRPO with baseline=leave_one_out; to choose another baseline: thorndike language grpo")
-    prepare_device(options.device, options.model)
+    prepare_device(options.device, options.model, options.devices)
     from thorndike.language.aligning import align, parse_reward
     from thorndike.language.over_optimisation import Limits
 
@@ -72,10 +82,11 @@ def run_policy_verb(verb: str, summary: str, words: Sequence[str]) -> Answer:
             show(f"{step}: reward {values['objective/score']:.3f}, {values['objective/kl']:.2f} nats, {length:.0f} tokens")
 
     rewards = [parse_reward(text) for text in options.reward]
-    outcome, found = align(
-        options.model, rewards, options.prompts, options.out, verb, settings, limits=limits, lora=lora_of(options.lora), seed=options.seed,
-        told=told,
-    )  # fmt: skip
+    with sharing(options.devices):
+        outcome, found = align(
+            options.model, rewards, options.prompts, options.out, verb, settings, limits=limits, lora=lora_of(options.lora),
+            seed=options.seed, dtype=options.dtype, told=told,
+        )  # fmt: skip
     data: dict[str, object] = {"run": options.out, "iterations": outcome.iterations, "stopped": outcome.stopped}
     if found is None:
         text = f"interrupted after {outcome.iterations} iterations\nthe same command again goes on from here"
@@ -103,7 +114,8 @@ def in_words(found: "Comparison") -> str:
     return "\n".join(lines)
 
 
-def _positive(text: str) -> float:
+def above_zero(text: str) -> float:
+    """A finite number above 0."""
     import argparse
     import math
 

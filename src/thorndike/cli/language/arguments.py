@@ -1,19 +1,20 @@
 """Arguments that the verbs of language models share; nothing heavy is imported for them."""
 
 import argparse
-import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
 
-from thorndike.cli.parser import Parser, positive_whole
+from thorndike.cli.parser import Parser, at_least_zero, positive_whole
 from thorndike.config_fields import fields_in_source
 from thorndike.errors import UserError
 from thorndike.settings import FieldFacts, describe_kind, parse_settings
-from thorndike.startup import choose_device
+from thorndike.startup import choose_device, cores, count_cores_as_devices, device_count, prepare_large_steps
 
 Config = TypeVar("Config")
 DEVICES = ("auto", "cpu", "gpu")
+DTYPES = ("float32", "bfloat16")
 _LARGE = 64 * 2**20
 """Bytes of parameters above which a model runs on whatever JAX finds fastest, on all processors."""
 
@@ -30,12 +31,20 @@ def add_device_argument(parser: Parser) -> None:
     parser.add_argument("--device", choices=DEVICES, default="auto", help="where it is computed (default: chosen by the model's size)")
 
 
+def add_precision_arguments(parser: Parser) -> None:
+    """In what precision it is computed, and how many devices share it."""
+    help_ = "of activations; parameters stay in float32 while they are learnt (default: the model's own)"
+    parser.add_argument("--dtype", choices=DTYPES, help=help_)
+    sharing = "how many devices (a CPU's cores) share every batch's rows (default: all accelerators; on a CPU 1)"
+    parser.add_argument("--devices", type=positive_whole, metavar="N", help=sharing)
+
+
 def add_sampling_arguments(parser: Parser, new_tokens: int) -> None:
     """How tokens are chosen."""
-    parser.add_argument("--temperature", type=_at_least_zero, default=1.0, metavar="T", help="0: always the likeliest token (default: 1)")
+    parser.add_argument("--temperature", type=at_least_zero, default=1.0, metavar="T", help="0: always the likeliest token (default: 1)")
     parser.add_argument("--top-k", type=_whole_at_least_zero, default=0, metavar="K", help="among the K likeliest; 0: all (default: 0)")
     parser.add_argument(
-        "--top-p", type=_at_least_zero, default=1.0, metavar="P", help="among the likeliest that make up P together (default: 1)"
+        "--top-p", type=at_least_zero, default=1.0, metavar="P", help="among the likeliest that make up P together (default: 1)"
     )
     parser.add_argument("--max-new-tokens", type=positive_whole, default=new_tokens, metavar="N", help=f"at most (default: {new_tokens})")
 
@@ -72,24 +81,29 @@ def settings_in_words(module: str) -> str:
     return "\n".join(f"  {each.name} = {each.default}  {each.comment or describe_kind(each.kind)}" for each in facts)
 
 
-def prepare_device(device: str, model: Path | None) -> None:
-    """Choose the device by the size of a model's files. Raises ``UserError`` where there is no model, or no such device."""
+def prepare_device(device: str, model: Path | None, devices: int | None = None) -> None:
+    """Choose the device by the size of a model's files. Raises ``UserError`` where there is no model, or no such device.
+
+    A CPU then counts as ``devices``, at most as many as it has cores, with a thread each.
+    """
     large = False
     if model is not None:
         if not (model / "config.json").is_file():
             raise UserError(f"{model} is no model: it has no config.json; give a folder as transformers' save_pretrained writes it")
         large = sum(path.stat().st_size for path in model.glob("*.safetensors")) > _LARGE
-    choose_device(device, large)
+    prepare_large_steps()
+    number = min(devices or 1, cores())
+    count_cores_as_devices(number)
+    choose_device(device, large, number if number > 1 else None)
 
 
-def _at_least_zero(text: str) -> float:
-    try:
-        number = float(text)
-    except ValueError:
-        number = math.nan
-    if not 0.0 <= number < math.inf:
-        raise argparse.ArgumentTypeError(f"expected a number of at least 0; got '{text}'")
-    return number
+@contextmanager
+def sharing(devices: int | None) -> Iterator[None]:
+    """Let the devices that there are, at most so many, share the rows of batches."""
+    from thorndike.training.devices import sharing_rows
+
+    with sharing_rows(device_count(devices)):
+        yield
 
 
 def _whole_at_least_zero(text: str) -> int:

@@ -5,7 +5,8 @@ from pathlib import Path
 
 from thorndike.cli.answer import Answer
 from thorndike.cli.language.aligning import add_training_arguments, lora_of
-from thorndike.cli.language.arguments import given_settings, prepare_device, settings_in_words
+from thorndike.cli.language.arguments import given_settings, prepare_device, settings_in_words, sharing
+from thorndike.cli.language.config_file import parse_with_config
 from thorndike.cli.language.report import report
 from thorndike.cli.parser import Parser
 
@@ -21,9 +22,13 @@ def run(words: Sequence[str]) -> Answer:
     parser = Parser("language dpo", "Direct preference optimisation on TRL's columns.", EXAMPLES.format(settings=settings_in_words("dpo")))
     add_training_arguments(parser)
     parser.add_argument("--data", type=Path, action="append", required=True, metavar="FILE", help="rows with chosen and rejected")
-    options = parser.parse(words)
+    options = parse_with_config(parser, words, "dpo", "dpo")
     settings = given_settings(options.settings, "dpo")
-    prepare_device(options.device, options.model)
+    prepare_device(options.device, options.model, options.devices)
     from thorndike.language.aligning import align_by_preferences
 
-    return report(align_by_preferences(options.model, options.data, options.out, settings, lora=lora_of(options.lora), seed=options.seed))
+    with sharing(options.devices):
+        found = align_by_preferences(
+            options.model, options.data, options.out, settings, lora=lora_of(options.lora), seed=options.seed, dtype=options.dtype
+        )
+    return report(found)

@@ -7,7 +7,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from thorndike.cli.answer import Answer
-from thorndike.cli.language.preference_store import add_store_arguments, existing_project, opened_store, share
+from thorndike.cli.language.preference_store import add_store_arguments, existing_project, media_folder, opened_store, share
 from thorndike.cli.parser import Parser, seed_number
 from thorndike.cli.studio import port_number
 from thorndike.errors import UserError
@@ -39,9 +39,7 @@ def run(words: Sequence[str]) -> Answer:
         return _simulate(options.db, options.project, options.simulate, (options.gold, options.repeats, options.seed))
     if find_spec("nicegui") is None:
         raise UserError("the page needs what the studio needs, which is not installed: pip install 'thorndike[web]'")
-    media = options.media if options.media is not None else Path("." if "://" in options.db else Path(options.db).parent)
-    if not media.is_dir():
-        raise UserError(f"--media {media} is not a folder")
+    media = media_folder(options.db, options.media)
     with opened_store(options.db) as store:
         from thorndike.language.preferences.assignment import Plan
         from thorndike.web.label import Labelling

@@ -4,6 +4,7 @@ import argparse
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from thorndike.cli.parser import Parser
@@ -23,10 +24,13 @@ def add_store_arguments(parser: Parser) -> None:
 
 
 @contextmanager
-def opened_store(where: str) -> Iterator["Store"]:
-    """The store, made where there is none. Raises ``UserError`` where SQLAlchemy is missing, or it cannot be opened."""
+def opened_store(where: str, new: bool = False) -> Iterator["Store"]:
+    """The store; ``new``: made where there is none. Raises ``UserError`` where SQLAlchemy is missing, or it cannot be opened."""
     if find_spec("sqlalchemy") is None:
         raise UserError("preferences need SQLAlchemy, which is not installed: pip install 'thorndike[language]'")
+    if not new and "://" not in where and Path(where).parent.is_dir() and not Path(where).exists():
+        # SQLite would make an empty file of a name that was mistyped.
+        raise UserError(f"there is no store {where}; put something in: thorndike language import FILE --db {where}")
     from thorndike.language.preferences.store import Store
 
     with Store(where) as store:
@@ -39,6 +43,14 @@ def existing_project(store: "Store", name: str) -> int:
     if name not in projects:
         raise UserError(f"the store has no project '{name}'{did_you_mean(name, projects)}; put something in: thorndike language import")
     return projects[name]
+
+
+def media_folder(where: str, given: Path | None) -> Path:
+    """The folder that a store's clips lie in: where the store is, unless another is given. Raises ``UserError`` for what is none."""
+    media = given if given is not None else Path("." if "://" in where else Path(where).parent)
+    if not media.is_dir():
+        raise UserError(f"--media {media} is not a folder")
+    return media
 
 
 def share(text: str) -> float:

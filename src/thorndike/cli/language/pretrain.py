@@ -12,6 +12,7 @@ from thorndike.cli.language.arguments import (
     prepare_device,
     settings_in_words,
 )
+from thorndike.cli.language.config_file import parse_with_config
 from thorndike.cli.language.report import report
 from thorndike.cli.parser import Parser, seed_number
 
@@ -31,7 +32,7 @@ def run(words: Sequence[str]) -> Answer:
     add_settings_argument(parser)
     parser.add_argument("--seed", type=seed_number, default=0, help="the number everything random follows from (default: 0)")
     add_device_argument(parser)
-    options = parser.parse(words)
+    options = parse_with_config(parser, words, "pretrain", "pretraining")
     settings = given_settings(options.settings, "pretraining")
     prepare_device(options.device, None)
     from thorndike.language.pretraining import Config, pretrain

@@ -6,12 +6,15 @@ from pathlib import Path
 from thorndike.cli.answer import Answer
 from thorndike.cli.language.arguments import (
     add_device_argument,
+    add_precision_arguments,
     add_settings_argument,
     configured,
     given_settings,
     prepare_device,
     settings_in_words,
+    sharing,
 )
+from thorndike.cli.language.config_file import parse_with_config
 from thorndike.cli.language.report import report
 from thorndike.cli.parser import Parser, positive_whole, seed_number
 
@@ -33,18 +36,21 @@ def run(words: Sequence[str]) -> Answer:
     parser.add_argument("--lora-alpha", type=positive_whole, metavar="ALPHA", help="the adapter's scale (default: twice its rank)")
     parser.add_argument("--lora-targets", metavar="NAMES", help="adapt only these modules: q_proj,v_proj (default: all matrices)")
     add_settings_argument(parser)
+    add_precision_arguments(parser)
     parser.add_argument("--seed", type=seed_number, default=0, help="the number everything random follows from (default: 0)")
     add_device_argument(parser)
-    options = parser.parse(words)
+    options = parse_with_config(parser, words, "sft", "sft")
     settings = given_settings(options.settings, "sft")
-    prepare_device(options.device, options.model)
+    prepare_device(options.device, options.model, options.devices)
     from thorndike.language.fine_tuning import fine_tune
     from thorndike.language.lora import LoraConfig
     from thorndike.language.sft import Config
 
     targets = tuple(options.lora_targets.split(",")) if options.lora_targets else ()
     lora = None if options.lora is None else LoraConfig(options.lora, float(options.lora_alpha or 2 * options.lora), targets)
-    found = fine_tune(
-        options.model, options.data, options.out, configured(Config, settings), lora=lora, held_out=options.held_out, seed=options.seed
-    )
+    with sharing(options.devices):
+        found = fine_tune(
+            options.model, options.data, options.out, configured(Config, settings), lora=lora, held_out=options.held_out,
+            seed=options.seed, dtype=options.dtype,
+        )  # fmt: skip
     return report(found)

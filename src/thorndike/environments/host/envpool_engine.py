@@ -66,7 +66,7 @@ class EnvPoolEngine:
         observation, action = shown.observation, shown.action
         check_spaces(observation, action, id)
         limit = shown.limit if max_episode_steps is None else max_episode_steps
-        self.spec = EnvSpec(id, observation, action, num_envs, limit, "envpool", can_vmap=False, can_restore=False, frames=own.frames)
+        self.spec = EnvSpec(id, observation, action, num_envs, limit, "envpool", frames=own.frames)
         self._limit = None if reference is None else limit
         self._settings = dict(env_kwargs)
         if limit is not None:

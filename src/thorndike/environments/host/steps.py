@@ -28,4 +28,4 @@ def host_spec(
     id: str, observation: gymnasium.Space, action: gymnasium.Space, num_envs: int, max_episode_steps: int | None, engine: str
 ) -> EnvSpec:
     """Facts about environments outside the compiled program, whose inner state can be neither vmapped nor restored."""
-    return EnvSpec(id, observation, action, num_envs, max_episode_steps, engine, can_vmap=False, can_restore=False)
+    return EnvSpec(id, observation, action, num_envs, max_episode_steps, engine)

@@ -75,10 +75,13 @@ def _checked(rows: Sequence[Row], where: str) -> Records:
 def write_records(path: str | Path, rows: Iterable[Mapping[str, object]]) -> int:
     """Write rows to a file, its form told by its ending; how many they were. The file is there as a whole, or as it was before.
 
-    In CSV what is no text is written as JSON, and ``read_records`` reads it back.
+    In CSV what is no text is written as JSON, and ``read_records`` reads it back. Raises ``UserError`` for a text that no file can hold,
+    and where nothing can be written.
     """
     path = Path(path)
     written = [dict(row) for row in rows]
+    for number, row in enumerate(written, start=1):
+        _check_text(row, f"{path}, row {number}", _DEEPEST)
     text = as_text(written, path.suffix.lower(), path)
     aside = path.with_name(f".{path.name}.{os.getpid()}")
     try:
@@ -134,9 +137,19 @@ def _format_of(row: Mapping[str, object], place: str) -> str:
         return "language_modeling"
     for name, columns in FORMATS.items():
         if all(row.get(column) is not None for column in columns):
+            if name == "prompt_only":
+                _refuse_half_a_preference(row, place)
             return name
     known = "; ".join(", ".join(columns) for columns in FORMATS.values())
     raise UserError(f"{place} has the columns {', '.join(map(quoted, row)) or '(none)'}, but some of these are expected: {known}")
+
+
+def _refuse_half_a_preference(row: Mapping[str, object], place: str) -> None:
+    """Raises for a row that would pass for a prompt alone, and whose one answer would be lost."""
+    there = [column for column in FORMATS["preference"] if row.get(column) is not None]
+    if len(there) == 1:
+        (missing,) = set(FORMATS["preference"]) - set(there)
+        raise UserError(f"{place} has '{there[0]}' but no '{missing}'")
 
 
 def _check_row(kind: str, row: Mapping[str, object], place: str) -> bool:
