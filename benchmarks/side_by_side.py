@@ -23,6 +23,8 @@ from thorndike.networks.masking import FORBIDDEN
 
 TOGETHER = 50
 """Positions that are searched at once, where nobody says otherwise: half of the games of a match wait for the same player."""
+RESIGNS = -1
+"""In place of a move: the game is lost."""
 Answer = Callable[[Sequence[Turn]], list[int]]
 
 
@@ -64,7 +66,15 @@ def mcts_side(game: Game, simulations: int, size: int = TOGETHER) -> Side:
 def engine_side(text: str, game: Game) -> Side:
     """A program of somebody else's, asked about one position after another."""
     player: Player = engine(text, game.id)
-    return Side(text, lambda turns: [player.choose(turn).action for turn in turns], player.close)
+
+    def answer(turns: Sequence[Turn]) -> list[int]:
+        choices = [player.choose(turn) for turn in turns]
+        for choice in choices:
+            if choice.resigns:
+                print(choice.remark, flush=True)
+        return [RESIGNS if choice.resigns else choice.action for choice in choices]
+
+    return Side(text, answer, player.close)
 
 
 def together(decide: Callable[[Position, int], jax.Array], size: int = TOGETHER) -> Answer:
@@ -93,7 +103,10 @@ class Played(NamedTuple):
 
 
 def play(game: Game, first: Side, second: Side, games: int, plies: int, seed: int = 0) -> Played:
-    """Game ``2k`` is begun by the first player, ``2k + 1`` from the same opening by the second. An illegal answer raises ValueError."""
+    """Game ``2k`` is begun by the first player, ``2k + 1`` from the same opening by the second.
+
+    Who resigns, or forfeits as an engine does, has lost; any other illegal answer raises ValueError.
+    """
     rules, key = compiled(game), jax.random.key(seed)
     begun = openings(rules, plies, seed)
     facts = jax.jit(jax.vmap(lambda p: (game.terminated(p), game.player(p), game.rewards(p)[0])))
@@ -106,9 +119,11 @@ def play(game: Game, first: Side, second: Side, games: int, plies: int, seed: in
 
     positions = jax.tree.map(lambda x: np.repeat(np.asarray(x)[None], games, axis=0), rules.init(seed))
     moves: list[list[int]] = [[] for _ in range(games)]
-    spent, asked = [0.0, 0.0], [0, 0]
+    spent, asked, won_by = [0.0, 0.0], [0, 0], np.zeros(games)
     while True:
-        over, mover, reward = (np.asarray(x) for x in facts(positions))
+        ended, mover, reward = (np.asarray(x) for x in facts(positions))
+        # By resignation: 1 for whoever moved first in the game, as the reward is.
+        over, reward = ended | (won_by != 0), np.where(won_by != 0, won_by, reward)
         if over.all():
             break
         allowed, actions = np.asarray(legal(positions)), np.zeros(games, np.int32)
@@ -126,10 +141,12 @@ def play(game: Game, first: Side, second: Side, games: int, plies: int, seed: in
                 actions[due[side]] = player.answer(turns)
             spent[side] += time.perf_counter() - began
             asked[side] += len(turns)
+        resigned = ~over & (actions == RESIGNS)
+        won_by[resigned], over = np.where(mover[resigned] == 0, -1.0, 1.0), over | resigned
         for i in np.flatnonzero(~over):
             if not allowed[i, actions[i]]:
                 raise ValueError(f"action {actions[i]} is not legal after {moves[i]}")
             moves[i].append(int(actions[i]))
-        positions = jax.tree.map(np.asarray, step(positions, actions, over))
+        positions = jax.tree.map(np.asarray, step(positions, np.maximum(actions, 0), over))
     scores = [(1.0 + (float(reward[i]) if i % 2 == 0 else -float(reward[i]))) / 2 for i in range(games)]
     return Played(scores, (spent[0] / max(asked[0], 1), spent[1] / max(asked[1], 1)))

@@ -3,7 +3,10 @@
 import importlib
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+from thorndike.games.tic_tac_toe import TIC_TAC_TOE
 
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
 
@@ -74,3 +77,17 @@ def test_the_driver_waits_for_a_process_and_counts_its_cpu(load):
 def test_a_contestant_that_hangs_is_killed(load):
     finished = load("processes").run_pinned(["sleep", "30"], {}, None, 0.2)
     assert finished.exit_code == -9 and finished.wall_s < 10
+
+
+def test_games_side_by_side_are_lost_by_who_resigns(load, quick_compile):
+    side_by_side = load("side_by_side")
+
+    def first_legal(turns):
+        return [int(np.flatnonzero(np.asarray(turn.game.legal(turn.position)))[0]) for turn in turns]
+
+    def gives_up(turns):
+        return [side_by_side.RESIGNS if len(turn.moves) >= 3 else move for turn, move in zip(turns, first_legal(turns), strict=True)]
+
+    plays_on, resigns = side_by_side.Side("plays on", first_legal), side_by_side.Side("resigns", gives_up)
+    assert side_by_side.play(TIC_TAC_TOE, resigns, plays_on, 6, 1).scores == [0.0] * 6
+    assert side_by_side.play(TIC_TAC_TOE, plays_on, resigns, 6, 1).scores == [1.0] * 6

@@ -104,7 +104,7 @@ def test_what_it_cannot_learn_is_refused():
     with pytest.raises(UserError, match=r"muzero takes Discrete actions; Pendulum-v1 has Box.*ppo, sac"):
         build_algorithm("muzero", {}, td.make("Pendulum-v1", 2).spec, None)
     spec = game_environment(TIC_TAC_TOE, 2).spec
-    with pytest.raises(UserError, match="two players without dice"):
+    with pytest.raises(UserError, match=r"two players without dice.*train it with ppo"):
         muzero(Config(), spec._replace(game=TIC_TAC_TOE._replace(has_chance=True)))
     with pytest.raises(UserError, match="buffer_size 10 holds fewer than the"):
         build_algorithm("muzero", {"buffer_size": 10, "train_freq": 2}, spec, None)

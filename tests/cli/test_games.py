@@ -2,6 +2,7 @@
 
 import io
 import json
+import math
 import os
 import signal
 import subprocess
@@ -12,6 +13,7 @@ from pathlib import Path
 import pytest
 
 import thorndike as td
+from thorndike.cli.arena import _elo
 from thorndike.cli.main import main
 from thorndike.games.sgf import read_sgf
 
@@ -54,6 +56,10 @@ def test_an_arena_for_people_has_a_row_for_each_player_and_match(capsys):
     record = read_sgf(Path("games/random-random__2.sgf").read_text(), "x")
     assert record.game == "connect_four"
     assert record.players == ("random", "random #2")
+
+
+def test_differences_are_whole_numbers_of_which_none_is_minus_zero():
+    assert [_elo(value) for value in (-0.3, 0.4, -12.6, math.inf, -math.inf, math.nan)] == ["+0", "+0", "-13", "+inf", "-inf", "?"]
 
 
 @pytest.mark.parametrize(
@@ -119,6 +125,15 @@ def test_the_other_one_may_begin_and_the_end_of_the_input_is_an_end(monkeypatch,
 
 
 @pytest.mark.slow
+def test_against_a_game_of_ones_own_with_dice_random_moves_are_the_default(place, monkeypatch, capsys):
+    place.joinpath("mine.py").write_text(
+        "from thorndike.games.tic_tac_toe import TIC_TAC_TOE\nDICE = TIC_TAC_TOE._replace(id='mine', has_chance=True)\n"
+    )
+    typed(monkeypatch, "quit")
+    assert main(["play", "mine.py:DICE"]) == 0
+    assert "mine against random" in capsys.readouterr().out
+
+
 def test_a_game_for_one_counts_its_points(monkeypatch, capsys):
     typed(monkeypatch, *["left", "up", "right", "down"] * 20, "undo", "hint")
     assert main(["play", "2048", "--json"]) == 0

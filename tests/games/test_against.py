@@ -6,6 +6,7 @@ import pytest
 from thorndike.environments import registry
 from thorndike.errors import UserError
 from thorndike.games.against import AgainstOpponent
+from thorndike.games.environment import game_environment
 from thorndike.games.settings import GameSettings, game_settings
 from thorndike.games.tic_tac_toe import TIC_TAC_TOE
 
@@ -75,6 +76,16 @@ def test_settings_that_cannot_be_are_one_line(given, message):
         game_settings("connect_four", given)
 
 
+def test_an_opponent_that_searches_is_refused_before_training_where_nothing_is_searched():
+    for id in ("backgammon", "2048"):
+        with pytest.raises(UserError, match="mcts plays games of two players without dice"):
+            game_settings(id, {"opponent": "mcts"})
+        game_settings(id, {"opponent": "random"})
+    for own in (TIC_TAC_TOE._replace(has_chance=True), TIC_TAC_TOE._replace(num_players=1)):
+        with pytest.raises(UserError, match="mcts plays games of two players without dice"):
+            game_environment(own, 2, GameSettings(opponent="mcts"))
+
+
 def test_a_game_is_chosen_by_id_by_name_and_as_it_is():
     assert registry.resolve("connect_four").engine == "native"
     named = registry.resolve("thorndike.games.tic_tac_toe:TIC_TAC_TOE")
@@ -84,6 +95,9 @@ def test_a_game_is_chosen_by_id_by_name_and_as_it_is():
     assert (built.spec.id, built.spec.num_envs, built.spec.game) == ("tic_tac_toe", 3, TIC_TAC_TOE)
     assert isinstance(registry.reference(given), AgainstOpponent)
     assert registry.game_of(registry.resolve("CartPole-v1")) is None
+    for named_or_given in ("connect_four", TIC_TAC_TOE):
+        with pytest.raises(UserError, match="ends by its rules: leave max_episode_steps out"):
+            registry.resolve(named_or_given, max_episode_steps=5)
     with pytest.raises(UserError, match="is a game, which is compiled"):
         registry.resolve("connect_four", engine="gymnasium")
     with pytest.raises(UserError, match="thorndike play connect_four"):

@@ -186,7 +186,7 @@ def build_parts(config: Config, spec: EnvSpec) -> Parts:
         raise UserError(f"muzero takes Discrete actions; {spec.id} has {spec.action_space}; ppo, sac and td3 take the others")
     game, of_two = spec.game, spec.game is not None and spec.game.num_players == 2
     if of_two and game is not None and game.has_chance:
-        raise UserError(f"muzero plays games of two players without dice (connect_four, ...), which {spec.id} is not")
+        raise UserError(f"muzero plays games of two players without dice (connect_four, ...), which {spec.id} is not: train it with ppo")
     actions, shape = int(spec.action_space.n), ModelShape(config.net_arch, config.cnn, config.state_size, config.width)
     view = view_of(spec, actions, config.symmetries)
     optimizer = clipped_adamw(config.max_grad_norm, config.weight_decay)

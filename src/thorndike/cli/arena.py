@@ -107,7 +107,7 @@ def _draw(found: "Arena") -> "RenderableType":
     rated = []
     for i in order:
         rating = found.ratings.players[i]
-        interval = f"{rating.elo:+.0f} [{rating.low:+.0f}, {rating.high:+.0f}]"
+        interval = f"{_elo(rating.elo)} [{_elo(rating.low)}, {_elo(rating.high)}]"
         rated.append({"player": found.players[i], "Elo [95 %]": interval, "games": rating.games, "score": f"{rating.score:.1%}"})
     matches = []
     for match in found.matches:
@@ -126,4 +126,5 @@ def _counts(counts: "Counts") -> str:
 
 
 def _elo(value: float) -> str:
-    return f"{value:+.0f}" if math.isfinite(value) else "?" if math.isnan(value) else "+inf" if value > 0 else "-inf"
+    # Whole numbers have no -0.
+    return f"{round(value):+d}" if math.isfinite(value) else "?" if math.isnan(value) else "+inf" if value > 0 else "-inf"

@@ -34,10 +34,18 @@ def check_game(name: str, alone: bool) -> bool:
     return one
 
 
+def can_be_searched(name: str) -> bool:
+    """Whether plain search plays it: a game of two without dice."""
+    if ":" in name:
+        found = game(name)
+        return found.num_players == 2 and not found.has_chance
+    return name not in (*WITH_DICE, *FOR_ONE)
+
+
 def choose_player(text: str, game_name: str, output: Path) -> str | Path:
     """A short name that can play, or the directory of the run meant. Raises UserError for anything else."""
     if not is_run(text):
-        check_player(text, game_name, game_name not in (*WITH_DICE, *FOR_ONE))
+        check_player(text, game_name, can_be_searched(game_name))
         return text
     if not exists(Path(text)) and text != "latest":
         runs = all_runs(output)

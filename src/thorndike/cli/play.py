@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from thorndike.cli.answer import Answer
-from thorndike.cli.choose_player import GAME_HELP, PLAYER_HELP, check_game, choose_player
+from thorndike.cli.choose_player import GAME_HELP, PLAYER_HELP, can_be_searched, check_game, choose_player
 from thorndike.cli.find_run import add_output_argument
 from thorndike.cli.parser import Parser, seed_number
 from thorndike.errors import UserError
@@ -38,7 +38,7 @@ def run(words: Sequence[str]) -> Answer:
         if against is not None or options.second:
             raise UserError(f"{options.game} is played by one: leave --against and --second out")
     else:
-        default = "trained" if trained_run(options.game) else "random" if options.game == "backgammon" else "mcts"
+        default = "trained" if trained_run(options.game) else "mcts" if can_be_searched(options.game) else "random"
         against = choose_player(default if against is None else against, options.game, options.output)
     playing = _begin(options.game, against, options.simulations, options.second, options.seed)
     try:
@@ -56,9 +56,9 @@ def _begin(game: str, against: str | Path | None, simulations: int, second: bool
 
     rules = find_game(game)
     opponent = None if against is None else player(against, game, simulations=simulations, seed=seed)
-    can_be_searched = rules.num_players == 2 and not rules.has_chance
+    searched = rules.num_players == 2 and not rules.has_chance
     adviser = opponent if opponent is not None and opponent.name != "random" else None
-    if adviser is None and can_be_searched:
+    if adviser is None and searched:
         adviser = player("mcts", rules, simulations=max(simulations, 1), seed=seed)
     compiles = opponent is not None and not (isinstance(against, str) and is_engine(against))
     return TerminalGame(rules, opponent, adviser, 1 if second else 0, seed, compiles)

@@ -77,7 +77,7 @@ def resolve(
         raise UserError(f"max_episode_steps must be at least 1, not {max_episode_steps}: leave it out to keep the environment's own")
     settings = dict(env_kwargs or {})
     if isinstance(environment, str):
-        chosen = _engine_of_name(environment, engine, settings)
+        chosen = _engine_of_name(environment, engine, settings, max_episode_steps)
         return Choice(environment, chosen, environment, settings, max_episode_steps)
     return _resolve_object(environment, engine, settings, max_episode_steps)
 
@@ -203,12 +203,12 @@ def environment_ids() -> dict[str, list[str]]:
     }
 
 
-def _engine_of_name(name: str, engine: str, settings: dict[str, object]) -> str:
+def _engine_of_name(name: str, engine: str, settings: dict[str, object], max_episode_steps: int | None) -> str:
     """The engine of an id; raises UserError if nobody has it or the engine asked for does not."""
     if is_game(name):
         if engine not in ("auto", "native"):
             raise UserError(f"{name} is a game, which is compiled: leave engine={engine!r} out")
-        game_settings(name, settings)
+        game_settings(name, settings, max_episode_steps)
         return "native"
     if engine in ("auto", "native") and name in NATIVE and _accepts(name, settings):
         return "native"
@@ -254,7 +254,7 @@ def _resolve_object(environment: "Named", engine: str, settings: dict[str, objec
     from thorndike.types import Environment
 
     if isinstance(environment, Game) and engine in ("auto", "native"):
-        game_settings(environment.id, settings)
+        game_settings(environment.id, settings, max_episode_steps)
         return Choice(environment.id, "native", environment, settings, max_episode_steps)
     if isinstance(environment, Environment | Dynamics):
         if engine not in ("auto", "native") or settings:

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int, Key
 from thorndike.errors import UserError
 from thorndike.games.game import Game, Position
 from thorndike.games.packing import packing
-from thorndike.games.settings import GameSettings
+from thorndike.games.settings import GameSettings, check_opponent
 from thorndike.networks.masking import BOARD, FORBIDDEN, MASK, POSITION
 from thorndike.types import Action, Environment, EnvSpec, Noise, Observation, Shared, Step
 
@@ -50,12 +50,16 @@ def observed_position(game: Game, position: Position) -> Observation:
 
 
 def game_environment(game: Game, num_envs: int, settings: GameSettings = SELF_PLAY) -> Environment:
-    """``num_envs`` games side by side, each begun anew when it ends, as ``settings`` say. Raises ``UserError`` if there are none."""
+    """``num_envs`` games side by side, each begun anew when it ends, as ``settings`` say. Raises ``UserError`` if there are none.
+
+    Raises it also for an opponent that cannot play this game, before anything is learnt for it to be evaluated against.
+    """
     # Dice make games differ by themselves.
     usual = 0 if game.has_chance else game.max_moves // 4
     share, plies = settings.opening_share, usual if settings.opening_plies is None else settings.opening_plies
     if num_envs < 1:
         raise UserError(f"num_envs of {game.id} must be at least 1, not {num_envs}: give a larger number")
+    check_opponent(game.id, settings.opponent, game.num_players == 2 and not game.has_chance)
     pool = -(-num_envs // _POOL)
 
     observe = jax.vmap(lambda position: observed_position(game, position))

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from thorndike.errors import UserError
+from thorndike.games.registry import FOR_ONE, WITH_DICE
 from thorndike.suggestions import did_you_mean
 
 OPPONENTS = ("random", "mcts")
@@ -24,8 +25,10 @@ class GameSettings(NamedTuple):
     """Games against the opponent begin with 0 to so many random moves, so that no two are alike."""
 
 
-def game_settings(id: str, given: Mapping[str, object]) -> GameSettings:
-    """Settings from an environment's keyword arguments. Raises ``UserError`` for unknown ones, and values that cannot be."""
+def game_settings(id: str, given: Mapping[str, object], max_episode_steps: int | None = None) -> GameSettings:
+    """Settings from an environment's keyword arguments. Raises ``UserError`` for unknown ones, values that cannot be, and a time limit."""
+    if max_episode_steps is not None:
+        raise UserError(f"{id} is a game, which ends by its rules: leave max_episode_steps out")
     for name in given:
         if name not in GameSettings._fields:
             raise UserError(f"{id} has no setting {name!r}{did_you_mean(name, GameSettings._fields)}")
@@ -40,6 +43,13 @@ def game_settings(id: str, given: Mapping[str, object]) -> GameSettings:
         raise UserError(f"{id}: eval_opening_plies is a number of moves, 0 or more, not {eval_plies!r}")
     if not isinstance(opponent, str) or opponent not in OPPONENTS:
         raise UserError(f"{id}: unknown opponent {opponent!r}{did_you_mean(str(opponent), OPPONENTS)}")
+    check_opponent(id, opponent, can_be_searched=id not in (*FOR_ONE, *WITH_DICE))
     if not isinstance(simulations, int) or simulations < 1:
         raise UserError(f"{id}: opponent_simulations is at least 1, not {simulations!r}")
     return GameSettings(share, plies, opponent, simulations, eval_plies)
+
+
+def check_opponent(id: str, opponent: str, can_be_searched: bool) -> None:
+    """Raises ``UserError`` for an opponent that searches a game with dice, or of one player."""
+    if opponent == "mcts" and not can_be_searched:
+        raise UserError(f"{id}: the opponent mcts plays games of two players without dice: leave opponent={opponent!r} out")
