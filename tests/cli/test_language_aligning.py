@@ -84,6 +84,18 @@ def test_an_interrupted_reward_model_goes_on_bit_for_bit(
     assert len((tmp_path / "metrics.jsonl").read_text().splitlines()) == 40 and list(tmp_path.glob("events.out.tfevents.*"))
 
 
+def test_a_run_whose_data_have_changed_is_not_gone_on_with(
+    folder: Path, reward: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    told, data = json.loads((folder / "reward" / "run.json").read_text()), str(folder / "preferences.jsonl")
+    assert list(told["files"]) == [data]
+    (tmp_path / "run.json").write_text(json.dumps(told | {"files": {data: "0" * 64}}))
+    words = [str(tmp_path) if word == str(folder / "reward") else word for word in reward_words(folder)]
+    assert main(["language", *words]) == 2
+    error = capsys.readouterr().err
+    assert f"{data} has changed since {tmp_path} was begun" in error and error.count("\n") == 1
+
+
 @pytest.mark.parametrize("verb", ["ppo", "rloo"])
 def test_a_policy_is_trained_on_it_and_compared(verb: str, folder: Path, reward: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = folder / verb
@@ -94,6 +106,7 @@ def test_a_policy_is_trained_on_it_and_compared(verb: str, folder: Path, reward:
     assert load_model(out / "model").config == load_model(folder / "base").config
     assert len((out / "metrics.jsonl").read_text().splitlines()) == 2 and json.loads((out / "comparison.json").read_text())["samples"]
     assert answer(capsys, *words) == found  # the same command finds it done
+    assert list(json.loads((out / "run.json").read_text())["files"]) == [str(folder / "prompts.jsonl")]
 
 
 def test_no_text_ends_where_the_policy_is_told_so(folder: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -107,6 +120,7 @@ def test_dpo_and_eval(folder: Path, reward: Path, capsys: pytest.CaptureFixture[
     words = ["dpo", str(folder / "base"), "--data", str(folder / "preferences.jsonl"), "--out", str(folder / "dpo")]
     found = answer(capsys, *words, "--set=batch_size=8", "--set=learning_rate=0.01", "--set=total_steps=12")
     assert found["status"] == "finished" and found["steps"] == 12 and found["train/reward_margin"] > 0
+    assert list(json.loads((folder / "dpo" / "run.json").read_text())["files"]) == [str(folder / "preferences.jsonl")]
     table = {"model": "base", "data": "preferences.jsonl", "out": "dpo"}
     lines = [f'{name} = "{folder / path}"' for name, path in table.items()]
     (folder / "way.toml").write_text("\n".join(["[dpo]", *lines, "batch_size = 8", "learning_rate = 0.01", "total_steps = 5"]))

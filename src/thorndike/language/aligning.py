@@ -103,7 +103,7 @@ def train_reward_model(
     config = configured(RewardConfig, {"total_steps": max(1, len(train.valid) // size), **settings, "batch_size": size})
     request = {"verb": "reward", "model": str(folder.absolute()), "data": [str(path.absolute()) for path in data], "members": members}
     request |= {"held_out": [str(path.absolute()) for path in held_out], "seed": seed, "settings": settings_of(config)}
-    open_run(out, request | precision(dtype) | ({} if lora is None else {"lora": settings_of(lora)}))
+    open_run(out, request | precision(dtype) | ({} if lora is None else {"lora": settings_of(lora)}), [*data, *held_out])
     if (out / MODEL).exists():
         return cast(HeldOut, load_reward_model(out / MODEL).held_out)
     learner = as_one(reward_model(config, base.config, lora), members)
@@ -151,7 +151,7 @@ def align(
         "verb": learner, "model": str(folder.absolute()), "rewards": [list(each) for each in rewards], "seed": seed,
         "prompts": [str(path.absolute()) for path in prompts], "settings": settings_of(config), "limits": settings_of(limits),
         "lora": None if lora is None else settings_of(lora), **precision(dtype),
-    })  # fmt: skip
+    }, prompts)  # fmt: skip
     task = Task(base, train, reward.score, _members(reward))
     outcome = train_policy(task, built, config, out, seed=seed, limits=limits, told=told)
     if not outcome.finished:
@@ -185,7 +185,7 @@ def align_by_preferences(
     open_run(out, {
         "verb": "dpo", "model": str(folder.absolute()), "data": [str(path.absolute()) for path in data], "seed": seed,
         "settings": settings_of(config), "lora": None if lora is None else settings_of(lora), **precision(dtype),
-    })  # fmt: skip
+    }, data)  # fmt: skip
     reference = direct.reference_log_probs(base.params, base.config, comparisons)
     learner, per_pass = direct.dpo(config, base.config, lora), rows // size
 
