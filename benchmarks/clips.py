@@ -109,7 +109,8 @@ def main() -> None:
         by_chance = random_return(options.environment)
         truth = [from_reward(options.environment, options.steps, seed, options.runs) for seed in range(options.seeds)]
         print({"by_chance": round(by_chance, 1), "true_reward": [round(value, 1) for value in truth]}, flush=True)
-        about = {"command": "python benchmarks/clips.py", "commit": commit(ROOT), "processor": processor()}
+        command = f"python benchmarks/clips.py --errors {' '.join(f'{each:g}' for each in options.errors)}"
+        about = {"command": command, "commit": commit(ROOT), "processor": processor()}
         about |= {"environment": options.environment, "steps": options.steps, "choices": CHOICES, "rounds": ROUNDS, "settings": SETTINGS}
         about |= {"episodes": EPISODES, "by_chance": by_chance, "true_reward": truth, "cases": []}
         for error_rate in options.errors:

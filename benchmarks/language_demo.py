@@ -1,8 +1,9 @@
 """The demo over seeds: `python benchmarks/language_demo.py --base MODEL [--seeds 11 12 13 14 15] [--learners ppo,rloo,dpo]`.
 
 Runs `thorndike language demo` once a seed into --runs, or goes on with what is there, and writes after each seed
-benchmarks/results/language/demo.json: the commands, every figure of the reports, without the texts, and what they give together: means over
-seeds with Student's 95 % intervals. `--tables` only prints the tables of docs/rlhf.md.
+benchmarks/results/language/demo.json: the commands, every figure of the runs, without the texts, and what they give together: means over
+seeds with Student's 95 % intervals. `--collect` runs nothing and takes the runs as they are; `--tables` only prints the tables of
+docs/rlhf.md.
 """
 
 import argparse
@@ -138,6 +139,7 @@ def main() -> None:
     parser.add_argument("--learners", default=",".join(LEARNERS))
     parser.add_argument("--runs", type=Path, default=Path("runs/demo"))
     parser.add_argument("--set", action="append", default=[], dest="settings")
+    parser.add_argument("--collect", action="store_true", help="run nothing: the figures of the runs as they are")
     parser.add_argument("--tables", action="store_true")
     options = parser.parse_args()
     if not options.tables:
@@ -145,12 +147,11 @@ def main() -> None:
         for seed in options.seeds:
             out = options.runs / str(seed)
             words = command(options.base, out, seed, options.learners, options.settings)
-            subprocess.run([sys.executable, "-m", *words], check=True)
+            if not options.collect:
+                subprocess.run([sys.executable, "-m", *words], check=True)
             commands.append(" ".join(words))
-            report = without_texts(json.loads((out / "report.json").read_text()))
-            # By name: what an earlier command found is kept in the run's stages.
-            stages = {path.stem: json.loads(path.read_text()) for path in (out / "stages").glob("*.json")}
-            reports.append(without_texts({**stages, **report}))
+            stages = {path.stem: json.loads(path.read_text()) for path in sorted((out / "stages").glob("*.json"))}
+            reports.append(without_texts({"seed": seed, **stages}))
             commit = json.loads((out / "run.json").read_text())["git_commit"]
             RESULTS.parent.mkdir(parents=True, exist_ok=True)
             content = {"commands": commands, "git_commit": commit, "seeds": options.seeds[: len(reports)]}

@@ -21,7 +21,7 @@ ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results" / "language" / "demo.json"
 PICTURE = ROOT / "docs" / "images" / "language_equal_kl.png"
 NAMES = {"ppo": "PPO", "rloo": "RLOO", "grpo": "GRPO", "dpo": "DPO", "ppo_max_kl": "PPO without a penalty"}
-LONGEST = 20.0
+LONGEST = 30.0
 Report = Mapping[str, object]
 
 

@@ -2,6 +2,7 @@
 
 python benchmarks/strength.py ours --budget 130     train the preset that long, into benchmarks/results/strength.json
 python benchmarks/strength.py plain --budget 900    the plain loop: 6 residual blocks of 64 channels, 32 simulations, one pass a batch
+python benchmarks/strength.py plain_patches --budget 60    the plain loop with the network of the preset: what is won without the network
 python benchmarks/strength.py --figure              both curves, docs/images/strength.png, and CPU-seconds to equal strength
 
 Both are stopped at the same kind of points and judged alike: every second of the positions of benchmarks/data/connect_four.txt (600), 32
@@ -13,6 +14,7 @@ import argparse
 import json
 import time
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -40,7 +42,11 @@ RESULT, FIGURE = ROOT / "benchmarks" / "results" / "strength.json", ROOT / "docs
 SIMULATIONS, JUDGED_TOGETHER = 32, 200
 GAMES, MOVES, MINIBATCH, LONGEST = 64, 42, 256, 42
 """Of the plain loop: games side by side, moves of each between two rounds of learning (a whole game), positions of a minibatch."""
-LABELS = {"ours": "thorndike train alphazero connect_four", "plain": "plain pgx + mctx loop, 6 x 64 convolutions"}
+LABELS = {
+    "ours": "thorndike train alphazero connect_four",
+    "plain": "plain pgx + mctx loop, 6 x 64 convolutions",
+    "plain_patches": "the same plain loop with our preset's network",
+}
 Learner = Iterator[tuple[int, Callable[[Sequence[str]], list[int]]]]
 """Positions played so far, and how it plays now; each step of the iterator learns a little more."""
 
@@ -71,10 +77,10 @@ def ours(seed: int) -> Learner:
         yield done * bound.steps_per_iteration, _judged(lambda games, actor=actor: decide(actor, positions_of(games)))
 
 
-def plain(seed: int) -> Learner:
+def plain(seed: int, tower: str = "conv", width: int = 64, blocks: int = 6) -> Learner:
     """Self-play of whole batches of games, then one pass over what was played, in minibatches of random order."""
     rules = pgx.make("connect_four")
-    network = board_network(7, "conv", 64, 6)
+    network = board_network(7, tower, width, blocks)
     params = network.init(jax.random.key(seed), jnp.zeros((1, 6, 7, 2)))
     optimizer = optax.adam(1e-3)
     opt_state = optimizer.init(params)
@@ -224,7 +230,8 @@ def judge(choose: Callable[[Sequence[str]], list[int]]) -> dict[str, float]:
 
 def measure(name: str, budget: float, seed: int, first: float) -> None:
     """Points at ``first`` CPU-seconds and each 1.5 times later, until the budget is spent."""
-    learner = {"ours": ours, "plain": plain}[name](seed)
+    learners = {"ours": ours, "plain": plain, "plain_patches": partial(plain, tower="patches", width=256, blocks=2)}
+    learner = learners[name](seed)
     points, spent, due = [], 0.0, first
     results = json.loads(RESULT.read_text(encoding="utf-8")) if RESULT.exists() else {}
     positions, choose = next(learner)
@@ -260,18 +267,22 @@ def compare() -> None:
     import matplotlib.pyplot as plt
 
     results = json.loads(RESULT.read_text(encoding="utf-8"))
-    theirs, rows = results["plain"]["points"], []
-    for point in results["ours"]["points"]:
-        own, error = point["cpu_s"], point["errors"]["all"]
-        reached = seconds_to(theirs, error)
-        ratio = (reached or theirs[-1]["cpu_s"]) / own
-        rows.append({"errors": error, "ours_cpu_s": own, "plain_cpu_s": reached, "ratio": round(ratio, 1), "at_least": reached is None})
+    rows = []
+    for name in (name for name in LABELS if name != "ours" and name in results):
+        theirs = results[name]["points"]
+        for point in results["ours"]["points"]:
+            own, error = point["cpu_s"], point["errors"]["all"]
+            reached = seconds_to(theirs, error)
+            ratio = round((reached or theirs[-1]["cpu_s"]) / own, 1)
+            rows.append(
+                {"against": name, "errors": error, "ours_cpu_s": own, "cpu_s": reached, "ratio": ratio, "at_least": reached is None}
+            )
     results["equal_strength"] = rows
     RESULT.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
     print(json.dumps(rows))
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(figsize=(7, 4))
-        for colour, name in zip(COLOURS, LABELS, strict=False):
+        for colour, name in zip(COLOURS, (name for name in LABELS if name in results), strict=False):
             points = results[name]["points"]
             axes.plot([p["cpu_s"] for p in points], [p["errors"]["all"] for p in points], "o-", color=colour, label=LABELS[name])
         axes.set(xscale="log", ylim=(0, None), xlabel="CPU-seconds of training, one core", ylabel=f"errors, {SIMULATIONS} simulations (%)")
@@ -283,7 +294,7 @@ def compare() -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("learner", nargs="?", choices=("ours", "plain"))
+    parser.add_argument("learner", nargs="?", choices=tuple(LABELS))
     parser.add_argument("--budget", type=float, default=300, help="CPU-seconds")
     parser.add_argument("--first", type=float, default=5, help="CPU-seconds to the first point")
     parser.add_argument("--seed", type=int, default=0)

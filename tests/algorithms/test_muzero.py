@@ -65,9 +65,9 @@ def test_the_loss_is_that_of_a_slow_loop():
     assert float(loss) == pytest.approx(by_hand["policy"] + 0.5 * by_hand["value"] + by_hand["reward"], rel=1e-4)
 
 
-def test_a_model_learns_a_chain_of_five_states_by_heart(quick_compile: None):
+def test_a_model_learns_a_chain_of_five_states_by_heart():
     """Right and left along five states, a reward of 2 for leaving on the right: what it imagines is worth what will come."""
-    gamma, unroll, count, scale = 0.8, 4, 256, Scale(3.0, 21)
+    gamma, unroll, count, scale = 0.8, 3, 64, Scale(3.0, 21)
     model = learned_model(spaces.Box(0.0, 1.0, (5,)), 2, 21, ModelShape((16,), "nature", 12, 24))
     imagination, random = Imagination(model, scale, gamma, VIEW), np.random.default_rng(0)
     place, actions = random.integers(0, 5, count), random.integers(0, 2, (unroll + 1, count))
@@ -132,4 +132,4 @@ def test_hardly_a_line_of_tic_tac_toe_is_lost_by_who_was_never_told_the_rules(tm
         walked = [lines.walk(choose, agent) for agent in (0, 1)]
         with capsys.disabled():
             print(f"\n{result.cpu_s:.0f} CPU-s; {simulations} simulations: first {walked[0]}, second {walked[1]}")
-        assert walked[0].lost + walked[1].lost <= LOST
+        assert walked[0].lost + walked[1].lost <= 30

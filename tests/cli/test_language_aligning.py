@@ -1,6 +1,7 @@
 """The verbs that learn from preferences and rewards: what they answer, what they leave behind, mistakes in one line."""
 
 import json
+import signal
 from pathlib import Path
 
 import jax
@@ -8,12 +9,14 @@ import numpy as np
 import pytest
 
 from thorndike.cli.main import main
+from thorndike.language import aligning
 from thorndike.language.decoder import initial_params
 from thorndike.language.model import LanguageModel, load_model, save_model
 from thorndike.language.preferences.assignment import Plan, next_assignments
 from thorndike.language.preferences.store import Store
 from thorndike.language.pretraining import Config, small_llama, train_tokenizer
 from thorndike.language.reward_files import load_reward_model
+from thorndike.language.reward_training import passes
 
 pytestmark = pytest.mark.usefixtures("quick_compile")
 SMALL = ["--set=episodes=8", "--set=batch_size=4", "--set=max_new_tokens=4", "--set=max_prompt_length=12", "--set=total_steps=2"]
@@ -43,12 +46,15 @@ def answer(capsys: pytest.CaptureFixture[str], *words: str) -> dict:
     return json.loads(told.out)
 
 
+def reward_words(folder: Path) -> list[str]:
+    words = ["reward", str(folder / "base"), "--data", str(folder / "preferences.jsonl"), "--out", str(folder / "reward"), "--members", "2"]
+    return [*words, "--set=pool=mean", "--set=batch_size=8", "--set=total_steps=40", "--set=learning_rate=0.01"]
+
+
 @pytest.fixture(scope="module")
 def reward(folder: Path) -> Path:
     """A reward model made by the command."""
-    words = ["--data", str(folder / "preferences.jsonl"), "--out", str(folder / "reward"), "--members", "2"]
-    settings = ["--set=pool=mean", "--set=batch_size=8", "--set=total_steps=40", "--set=learning_rate=0.01"]
-    assert main(["language", "reward", str(folder / "base"), *words, *settings]) == 0
+    assert main(["language", *reward_words(folder)]) == 0
     return folder / "reward" / "model"
 
 
@@ -57,6 +63,37 @@ def test_a_reward_model_says_how_good_it_is(folder: Path, reward: Path) -> None:
     assert len(model.members) == 2 and model.held_out is not None
     assert told["pairs"] == model.held_out.pairs == 8 and told["accuracy"] == model.held_out.accuracy > 0.9
     assert model.pool == "mean" and model.deviation > 0
+
+
+def test_an_interrupted_reward_model_goes_on_bit_for_bit(
+    folder: Path, reward: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = [str(tmp_path) if word == str(folder / "reward") else word for word in reward_words(folder)]
+
+    def stopping(*given):
+        batch = passes(*given)
+        return lambda step, state: signal.raise_signal(signal.SIGINT) or batch(step, state) if step == 20 else batch(step, state)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(aligning, "passes", stopping)
+        assert main(["language", *words]) == 130 and "goes on from here" in capsys.readouterr().out
+    assert not (tmp_path / "model").exists() and (tmp_path / "checkpoints" / "21").is_dir()
+    assert answer(capsys, *words)["status"] == "finished"
+    for name in ("model.safetensors", "member-1/model.safetensors", "reward.json"):
+        assert (tmp_path / "model" / name).read_bytes() == (reward / name).read_bytes()
+    assert len((tmp_path / "metrics.jsonl").read_text().splitlines()) == 40 and list(tmp_path.glob("events.out.tfevents.*"))
+
+
+def test_a_run_whose_data_have_changed_is_not_gone_on_with(
+    folder: Path, reward: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    told, data = json.loads((folder / "reward" / "run.json").read_text()), str(folder / "preferences.jsonl")
+    assert list(told["files"]) == [data]
+    (tmp_path / "run.json").write_text(json.dumps(told | {"files": {data: "0" * 64}}))
+    words = [str(tmp_path) if word == str(folder / "reward") else word for word in reward_words(folder)]
+    assert main(["language", *words]) == 2
+    error = capsys.readouterr().err
+    assert f"{data} has changed since {tmp_path} was begun" in error and error.count("\n") == 1
 
 
 @pytest.mark.parametrize("verb", ["ppo", "rloo"])
@@ -69,6 +106,7 @@ def test_a_policy_is_trained_on_it_and_compared(verb: str, folder: Path, reward:
     assert load_model(out / "model").config == load_model(folder / "base").config
     assert len((out / "metrics.jsonl").read_text().splitlines()) == 2 and json.loads((out / "comparison.json").read_text())["samples"]
     assert answer(capsys, *words) == found  # the same command finds it done
+    assert list(json.loads((out / "run.json").read_text())["files"]) == [str(folder / "prompts.jsonl")]
 
 
 def test_no_text_ends_where_the_policy_is_told_so(folder: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -82,6 +120,7 @@ def test_dpo_and_eval(folder: Path, reward: Path, capsys: pytest.CaptureFixture[
     words = ["dpo", str(folder / "base"), "--data", str(folder / "preferences.jsonl"), "--out", str(folder / "dpo")]
     found = answer(capsys, *words, "--set=batch_size=8", "--set=learning_rate=0.01", "--set=total_steps=12")
     assert found["status"] == "finished" and found["steps"] == 12 and found["train/reward_margin"] > 0
+    assert list(json.loads((folder / "dpo" / "run.json").read_text())["files"]) == [str(folder / "preferences.jsonl")]
     table = {"model": "base", "data": "preferences.jsonl", "out": "dpo"}
     lines = [f'{name} = "{folder / path}"' for name, path in table.items()]
     (folder / "way.toml").write_text("\n".join(["[dpo]", *lines, "batch_size = 8", "learning_rate = 0.01", "total_steps = 5"]))
@@ -158,7 +197,9 @@ def test_mistakes_are_one_line(folder: Path, reward: Path, capsys: pytest.Captur
         (["dpo", base, "--data", str(tmp_path / "odd.jsonl"), "--out", str(tmp_path / "y")], "odd.jsonl, row 1: p_chosen is 2"),
         (["reward", base, "--data", prompts, "--out", str(tmp_path / "y")], "expected a preference"),
         (["eval", str(reward), "--base", base, "--prompts", prompts, "--reward", str(reward)], "not of the shape"),
-        (["ask", "--db", str(folder / "p.db"), "--reward", str(reward)], "no project 'default'"),
+        (["ask", "--db", str(folder / "p.db"), "--reward", str(reward)], "there is no store"),
+        (["eval", base, "--base", base, "--prompts", prompts, "--reward", str(reward), "--temperature", "0"], "above 0"),
+        ([*reward_words(folder), "--lora", "2"], "begun with another lora"),
         (["demo", "--out", str(tmp_path / "z"), "--learners", "pppo"], "did you mean 'ppo'"),
     ]
     for words, expected in cases:

@@ -89,11 +89,32 @@ def test_a_file_that_is_not_there_or_no_text(tmp_path, capsys):
         assert expected in error and error.count("\n") == 1
 
 
-@pytest.mark.parametrize("step", [step for step in STEPS if step != "pretrain"])
+@pytest.mark.parametrize("step", [step for step in STEPS if step not in ("pretrain", "label")])
 def test_every_table_of_the_example_is_understood(step, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(["language", step, "--config", str(EXAMPLE)]) == 2
     assert "is no model: it has no config.json" in capsys.readouterr().err, "read to the end: only the model is missing here"
+
+
+def test_labelling_reads_it_too(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["language", "label", "--config", str(EXAMPLE)]) == 2
+    assert "there is no store prefs.db" in capsys.readouterr().err
+    assert main(["language", "label", "--config", str(EXAMPLE), "--db", "mine.db"]) == 2
+    assert "there is no store mine.db" in capsys.readouterr().err
+    (tmp_path / "x.toml").write_text('[label]\ndb = "prefs.db"\ngold = 2\n')
+    assert main(["language", "label", "--config", "x.toml"]) == 2
+    assert "x.toml: [label] gold" in capsys.readouterr().err
+
+
+def test_prompts_of_generate_may_stand_in_it(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "x.toml").write_text('[generate]\nmodel = "m"\n')
+    assert main(["language", "generate", "--config", "x.toml"]) == 2
+    assert "generate needs prompts" in capsys.readouterr().err
+    (tmp_path / "x.toml").write_text('[generate]\nmodel = "m"\nprompt = ["The film", "The play"]\nignore_eos = true\n')
+    assert main(["language", "generate", "--config", "x.toml"]) == 2
+    assert "m is no model" in capsys.readouterr().err
 
 
 def test_pretraining_reads_it_too(tmp_path, capsys):

@@ -57,6 +57,8 @@ def test_an_export_can_be_imported_and_nothing_is_written_over(folder, capsys, t
         (["agree", "--db", "p.db", "--project", "defualt"], "did you mean 'default'"),
         (["agree"], "required: --db"),
         (["agree", "--db", "no/such/x.db"], "no folder"),
+        (["agree", "--db", "none.db"], "there is no store none.db"),
+        (["label", "--db", "none.db"], "there is no store none.db"),
         (["export", "--db", "p.db", "--to", "x.parquet"], "ends in"),
         (["import", "nothing.jsonl", "--db", "p.db"], "cannot be read"),
         (["import", "c.jsonl", "--db", "p.db", "--share-to-three", "2"], "from 0 to 1"),

@@ -147,7 +147,7 @@ def test_a_throw_that_somebody_else_began_is_refused_in_one_line(rules):
     except UserError:
         pytest.skip("GNU Backgammon is not installed")
     position = begun(rules, 3, 1)
-    position = rules.step(position, actions_of(rules.game, position, [(8, 5)])[0], 0, 0)
+    position = rules.step(position, actions_of(rules.game, position, [(8, 5), (6, 5)])[0], 0, 0)
     player = engine("gnubg", "backgammon")
     try:
         with pytest.raises(UserError, match="at the next throw"):

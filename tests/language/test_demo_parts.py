@@ -241,7 +241,7 @@ def test_the_demo_from_end_to_end_goes_on_where_it_stopped(tmp_path: Path, monke
     train, held_out = demo.review_prompts(reviews, tokenizer, 16)
     assert all(text.startswith(" ") for text in train.texts)
     data = demo.Data(base, train, held_out, rated, sentiment.Lexicon({"good": 2.0, "bad": -2.0, "fine": 1.0}))
-    small = demo.Config(total_steps=2, episodes=16, max_new_tokens=4, reward_epochs=8, pairs=40, held_out=16)
+    small = demo.Config(total_steps=2, free_steps=2, episodes=16, max_new_tokens=4, reward_epochs=8, pairs=40, held_out=16)
     lines: list[str] = []
     found = demo.run_demo(tmp_path / "run", data, small, LEARNERS, 0, lines.append)
     assert {"labels", "reward", "best_of_n", *LEARNERS} <= set(found)

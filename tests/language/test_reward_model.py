@@ -10,6 +10,7 @@ import pytest
 
 from language.make_reference import REFERENCE
 from thorndike.errors import UserError
+from thorndike.language import reward_files
 from thorndike.language.comparisons import Comparison, Pair, comparison_data, preferred, ranked
 from thorndike.language.lora import LoraConfig
 from thorndike.language.model import load_decoder
@@ -85,6 +86,20 @@ def _language_model(tmp_path: Path) -> Path:
 
     save_model(LanguageModel(CONFIG, PARAMS, load_tokenizer(REFERENCE / "tokenizer")), tmp_path / "plain")
     return tmp_path / "plain"
+
+
+def test_half_of_a_model_is_never_taken_for_one(fitted, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    model = RewardModel(CONFIG, tuple(fitted[0]), load_tokenizer(REFERENCE / "tokenizer"), "mean")
+    with monkeypatch.context() as patch:
+        patch.setattr(reward_files, "as_bytes", lambda facts: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            save_reward_model(model, tmp_path / "reward")
+    assert not (tmp_path / "reward").exists(), "its members were written, and not what they mean"
+    (tmp_path / "reward.partial").mkdir()
+    (tmp_path / "reward.partial" / "config.json").write_text("of a process that was killed")
+    save_reward_model(model, tmp_path / "reward")
+    assert len(load_reward_model(tmp_path / "reward").members) == 2
+    assert [path.name for path in tmp_path.iterdir()] == ["reward"]
 
 
 def test_the_loss_is_that_of_a_loop_over_pairs():

@@ -111,6 +111,20 @@ def test_a_run_is_gone_on_with_only_as_it_was_begun(tmp_path: Path) -> None:
         open_run(tmp_path / "other", {})
 
 
+def test_a_file_that_has_changed_is_not_learnt_from(tmp_path: Path) -> None:
+    data, run = tmp_path / "data.jsonl", tmp_path / "run"
+    data.write_text("one")
+    open_run(run, {}, [data])
+    open_run(run, {}, [data])
+    data.write_text("two")
+    with pytest.raises(UserError, match=r"data\.jsonl has changed since .*run was begun"):
+        open_run(run, {}, [data])
+    told = json.loads((run / "run.json").read_text())
+    del told["files"]
+    (run / "run.json").write_text(json.dumps(told))
+    open_run(run, {}, [data])  # begun by an older version
+
+
 def test_a_loss_that_is_not_finite_ends_the_run(tmp_path: Path) -> None:
     open_run(tmp_path / "run", {})
     broken = jax.tree.map(lambda leaf: leaf * jnp.nan, PARAMS)

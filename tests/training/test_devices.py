@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from thorndike import startup
 from thorndike.errors import UserError
 from thorndike.startup import device_count, without_device_count
 from thorndike.training.devices import devices_for
@@ -43,6 +44,18 @@ def test_as_many_devices_are_used_as_there_are_and_were_asked_for():
 
 def test_the_number_of_devices_is_no_difference_between_machines():
     assert without_device_count("--a=1 --xla_force_host_platform_device_count=2 --b=2") == "--a=1 --b=2"
+
+
+@pytest.mark.parametrize(("jaxlib", "known"), [("0.10.2", True), ("0.99.0", False)])
+def test_xla_is_given_an_option_once_and_only_where_it_knows_it(jaxlib, known, monkeypatch):
+    monkeypatch.setattr(startup, "version", lambda package: jaxlib)
+    # Memory of this process stays as it is.
+    monkeypatch.setattr(startup.sys, "platform", "elsewhere")
+    monkeypatch.setenv("XLA_FLAGS", "--mine=1")
+    for _ in range(2):
+        startup.prepare_large_steps()
+    option = "--xla_cpu_enable_concurrency_optimized_scheduler=false"
+    assert startup.os.environ["XLA_FLAGS"] == (f"--mine=1 {option}" if known else "--mine=1")
 
 
 def digest(path: Path) -> str:

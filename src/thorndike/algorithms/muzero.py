@@ -5,14 +5,14 @@ Gumbel: Danihelka et al. 2022, "Policy improvement by planning with Gumbel". Dev
 
 1. The search may be Gumbel's (the default), whose policy improves even with few simulations.
 2. Values are bootstrapped by what the running average of the network says of them now (``bootstrap="search"``: by what a search said when
-   they were played, as in the paper, which falls behind where values grow).
+   they were played, as in the paper, which may fall behind where values grow).
 3. What acts, and is exported, is that running average (``averaging``).
 4. Values are stretched by the best and the worst action of their node, not of the whole tree; in games too they are the paper's transformed
    probabilities of atoms. A game's value changes its sign from each state to the next: players take turns.
 5. Sequences are drawn uniformly. Behind a termination the model is taught that nothing comes; behind a time limit it is taught nothing,
    and the value goes on at the observation that was cut.
 6. States are rows of numbers, of images too; rewards are told by the state that they lead to. AdamW, gradients clipped.
-7. Actions are drawn at one temperature, a schedule over the run, in all moves of a game.
+7. Actions are drawn at one temperature, a schedule over the run, in all moves of a game. Symmetries of a board turn what is learnt from.
 
 Logs ``train/loss``, ``policy_loss``, ``value_loss``, ``reward_loss`` (of all K steps), ``target_entropy`` (of the search's policies),
 ``value_mean`` (of the targets), ``grad_norm``, ``learning_rate``. Results and their commands: docs/algorithms/muzero.md.

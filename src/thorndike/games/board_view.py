@@ -38,8 +38,9 @@ def view_of(spec: EnvSpec, actions: int, symmetries: bool = True) -> View:
 
     Raises ``UserError`` if its mask does not fit the actions, and for a game whose observations a wrapper changed.
     """
-    space, turn = spec.observation_space, _as_it_is
+    space = spec.observation_space
     see: Callable[[Observation], Observation] = _as_it_is
+    turn: Callable[[Unrolled], Unrolled] = _as_it_is
     if spec.game is not None:
         check_observations(spec, spec.game)
         size = int(np.prod(spec.game.observation_shape))

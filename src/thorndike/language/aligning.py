@@ -27,7 +27,7 @@ from thorndike.language.reward_files import RewardModel, load_reward_model, norm
 from thorndike.language.reward_model import Config as RewardConfig
 from thorndike.language.reward_model import reward_model
 from thorndike.language.reward_report import HeldOut
-from thorndike.language.reward_training import Log, fit, report_on, scores_of
+from thorndike.language.reward_training import as_one, passes, report_on, scores_of
 from thorndike.language.rewards import Score, model_score, weighted_sum
 from thorndike.language.rollouts import Written, make_prompts
 from thorndike.language.text_run import MODEL, TextOutcome, TextPlan, open_run, run_learner
@@ -83,9 +83,12 @@ def load_rewards(parts: Sequence[Reward], base: LanguageModel) -> Rewards:
 
 def train_reward_model(
     folder: Path, data: Sequence[Path], held_out: Sequence[Path], out: Path, settings: Mapping[str, object], *, members: int = 1,
-    seed: int = 0, lora: LoraConfig | None = None, dtype: Dtype | None = None, log: Log | None = None,
-) -> HeldOut:  # fmt: skip
-    """A reward model from files of preferences, in ``out/model``. Without ``held_out`` a tenth of them is kept to measure with."""
+    seed: int = 0, lora: LoraConfig | None = None, dtype: Dtype | None = None, progress: bool = True,
+) -> HeldOut | None:  # fmt: skip
+    """A reward model from files of preferences, in ``out/model``. Without ``held_out`` a tenth of them is kept to measure with.
+
+    Goes on where it stopped; nothing is found if it is interrupted.
+    """
     plain = load_model(folder)
     base = computing_in(plain, dtype)
     comparisons = read_comparisons(data, base.tokenizer)
@@ -99,11 +102,16 @@ def train_reward_model(
     size = min(int(cast(int, settings.get("batch_size", 32))), max(1, len(train.valid)))
     config = configured(RewardConfig, {"total_steps": max(1, len(train.valid) // size), **settings, "batch_size": size})
     request = {"verb": "reward", "model": str(folder.absolute()), "data": [str(path.absolute()) for path in data], "members": members}
-    request |= precision(dtype)
-    open_run(out, request | {"held_out": [str(path.absolute()) for path in held_out], "seed": seed, "settings": settings_of(config)})
+    request |= {"held_out": [str(path.absolute()) for path in held_out], "seed": seed, "settings": settings_of(config)}
+    open_run(out, request | precision(dtype) | ({} if lora is None else {"lora": settings_of(lora)}), [*data, *held_out])
     if (out / MODEL).exists():
         return cast(HeldOut, load_reward_model(out / MODEL).held_out)
-    learnt = fit(reward_model(config, base.config, lora), config, base.params, train, members=members, seed=seed, log=log)
+    learner = as_one(reward_model(config, base.config, lora), members)
+    plan = TextPlan(config.total_steps, log_every=max(1, config.total_steps // 100), checkpoint_every=max(1, config.total_steps // 5))
+    outcome = run_learner(out, learner, base.params, passes(train, config, members, seed), plan, seed, progress=progress)
+    if outcome.status != "finished":
+        return None
+    learnt = learner.params(outcome.state, base.params)
     scored = replace(plain.config, num_labels=1)
     found = report_on(scores_of(learnt, scored, test, config.pool).mean(axis=0), test)
     model = RewardModel(scored, tuple(learnt), base.tokenizer, config.pool, held_out=found)
@@ -143,7 +151,7 @@ def align(
         "verb": learner, "model": str(folder.absolute()), "rewards": [list(each) for each in rewards], "seed": seed,
         "prompts": [str(path.absolute()) for path in prompts], "settings": settings_of(config), "limits": settings_of(limits),
         "lora": None if lora is None else settings_of(lora), **precision(dtype),
-    })  # fmt: skip
+    }, prompts)  # fmt: skip
     task = Task(base, train, reward.score, _members(reward))
     outcome = train_policy(task, built, config, out, seed=seed, limits=limits, told=told)
     if not outcome.finished:
@@ -177,7 +185,7 @@ def align_by_preferences(
     open_run(out, {
         "verb": "dpo", "model": str(folder.absolute()), "data": [str(path.absolute()) for path in data], "seed": seed,
         "settings": settings_of(config), "lora": None if lora is None else settings_of(lora), **precision(dtype),
-    })  # fmt: skip
+    }, data)  # fmt: skip
     reference = direct.reference_log_probs(base.params, base.config, comparisons)
     learner, per_pass = direct.dpo(config, base.config, lora), rows // size
 

@@ -49,6 +49,7 @@ class Config:
     """How large the demo is."""
 
     total_steps: Annotated[int, AtLeast(1)] = 40  # iterations of PPO, GRPO and RLOO
+    free_steps: Annotated[int, AtLeast(1)] = 60  # iterations of PPO without a penalty
     episodes: Annotated[int, AtLeast(8)] = 128  # texts of an iteration
     max_new_tokens: Annotated[int, AtLeast(2)] = 24  # tokens of a completion
     ignore_eos: bool = True  # every text has so many, as in the paper: none is ended early
@@ -60,7 +61,7 @@ class Config:
     reward_members: Annotated[int, AtLeast(1)] = 1  # reward models whose mean is the reward; of several, disagreement is watched
     pairs: Annotated[int, AtLeast(1)] = 4000  # of texts that the crowd judges
     dpo_learning_rate: Annotated[float, MoreThan(0)] = 3e-4  # of DPO, which takes one pass over the pairs, falling to 0
-    max_kl: Annotated[float, MoreThan(0)] = 20.0  # nats a text beyond which a policy is stopped
+    max_kl: Annotated[float, MoreThan(0)] = 30.0  # nats a text beyond which a policy is stopped
     held_out: Annotated[int, AtLeast(1)] = 512  # prompts that policy and base are compared on
 
     def __post_init__(self) -> None:
@@ -238,7 +239,7 @@ def _by_rewards(
 def _ppo_settings(config: Config, free: bool) -> proximal.Config:
     """``free``: without any penalty for leaving the base, and with a rate that does not fall."""
     return proximal.Config(
-        total_steps=config.total_steps,
+        total_steps=config.free_steps if free else config.total_steps,
         episodes=config.episodes,
         batch_size=config.episodes // 2,
         n_epochs=2,

@@ -50,7 +50,7 @@ def fine_tune(
     }
     length = min(config.max_length, model.config.max_positions)
     rows = _rows(data, model, length)
-    open_run(out, request)
+    open_run(out, request, [*data, *held_out])
     learner = sft(config, model.config, lora)
     frozen, score = learner.frozen(model.params), jax.jit(learner.evaluate)
     measured = _rows(held_out, model, length) if held_out else None

@@ -1,5 +1,8 @@
 """A language model: its config, its parameters and its tokenizer, read from and written to a Hugging Face folder."""
 
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -72,15 +75,31 @@ def load_decoder(folder: str | Path, *, dtype: Dtype | None = None) -> tuple[Mod
 
 def save_model(model: LanguageModel, folder: str | Path, shard_bytes: int = SHARD) -> None:
     """Write a folder that transformers and vLLM load. Raises ``UserError`` if there is something in it already."""
-    path = Path(folder)
+    config = model.config
+    with whole_folder(folder) as path:
+        write_model_config(config, path)
+        if not config.num_labels:
+            content = as_json(config)
+            tokens = {name: content[name] for name in ("bos_token_id", "eos_token_id", "pad_token_id") if content[name] is not None}
+            (path / "generation_config.json").write_bytes(as_bytes(tokens))
+        save_params(model.params, config, path, shard_bytes)
+        save_tokenizer(model.tokenizer, path)
+
+
+@contextmanager
+def whole_folder(folder: str | Path) -> Iterator[Path]:
+    """A folder to write to, renamed to ``folder`` at the end of the block: a process killed before leaves nothing that looks like a model.
+
+    Raises ``UserError`` if there is something in ``folder`` already.
+    """
+    path = Path(folder).resolve()
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise UserError(f"{folder} is there already: a model is never written over; choose another folder")
-    path.mkdir(parents=True, exist_ok=True)
-    config = model.config
-    write_model_config(config, path)
-    if not config.num_labels:
-        content = as_json(config)
-        tokens = {name: content[name] for name in ("bos_token_id", "eos_token_id", "pad_token_id") if content[name] is not None}
-        (path / "generation_config.json").write_bytes(as_bytes(tokens))
-    save_params(model.params, config, path, shard_bytes)
-    save_tokenizer(model.tokenizer, path)
+    aside = path.with_name(f"{path.name}.partial")
+    shutil.rmtree(aside, ignore_errors=True)
+    aside.mkdir(parents=True)
+    try:
+        yield aside
+        aside.replace(path)
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, Int
 from thorndike.errors import UserError
 from thorndike.language.decoder import Params
 from thorndike.language.generation import bucket
-from thorndike.language.model import LanguageModel, load_decoder, load_model, save_model
+from thorndike.language.model import LanguageModel, load_decoder, load_model, save_model, whole_folder
 from thorndike.language.model_config import ModelConfig
 from thorndike.language.reward_report import GapAccuracy, HeldOut
 from thorndike.language.scalar_head import text_scores
@@ -77,14 +77,14 @@ def refuse_if_near_chance(model: RewardModel) -> None:
 
 def save_reward_model(model: RewardModel, folder: str | Path) -> None:
     """Write a new folder. Raises ``UserError`` if there is something in it already."""
-    path = Path(folder)
     config = replace(model.config, num_labels=1)
-    save_model(LanguageModel(config, model.members[0], model.tokenizer), path)
-    for number, params in enumerate(model.members[1:], 1):
-        save_model(LanguageModel(config, params, model.tokenizer), path / f"member-{number}")
     facts: Json = {"pool": model.pool, "mean": model.mean, "deviation": model.deviation, "members": len(model.members)}
     facts["held_out"] = None if model.held_out is None else _as_json(model.held_out)
-    (path / FACTS).write_bytes(as_bytes(facts))
+    with whole_folder(folder) as path:
+        save_model(LanguageModel(config, model.members[0], model.tokenizer), path)
+        for number, params in enumerate(model.members[1:], 1):
+            save_model(LanguageModel(config, params, model.tokenizer), path / f"member-{number}")
+        (path / FACTS).write_bytes(as_bytes(facts))
 
 
 def load_reward_model(folder: str | Path) -> RewardModel:

@@ -1,12 +1,11 @@
 """Training reward models: an ensemble whose members differ in their heads and their orders of the data, in one compiled program."""
 
 from collections.abc import Callable
-from functools import partial
-from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float, Key
 
 from thorndike.errors import UserError
 from thorndike.language.comparisons import ComparisonBatch, ComparisonData
@@ -21,47 +20,53 @@ Log = Callable[[int, dict[str, list[float]]], None]
 """Gradient steps so far, and each member's metrics."""
 
 
-class Ensemble(NamedTuple):
-    """States with an axis of members in front, and functions of them."""
-
-    states: State
-    update: Callable[[State, Params, ComparisonBatch], tuple[State, Metrics]]
-
-
-def ensemble(learner: Learner, params: Params, members: int, seed: int) -> Ensemble:
-    """So many independent reward models on one trunk.
+def as_one(learner: Learner, members: int) -> Learner:
+    """So many independent reward models on one trunk as one learner; its batches have an axis of members in front, ``params`` gives a list.
 
     Members run one after the other inside one program: on a CPU a matrix product with an axis of members in front is slower.
     """
-    keys = jax.random.split(jax.random.key(seed), members)
-    states = jax.jit(lambda ks: jax.lax.map(lambda key: learner.init(params, key), ks))(keys)
 
-    @partial(jax.jit, donate_argnums=0)
-    def update(states: State, frozen: Params, batches: ComparisonBatch) -> tuple[State, Metrics]:
-        return jax.lax.map(lambda each: learner.update(each[0], frozen, each[1]), (states, batches))
+    def init(params: Params, key: Key[Array, ""]) -> State:
+        keys = jax.random.split(key, members)
+        return State(jax.jit(lambda ks: jax.lax.map(lambda key: learner.init(params, key), ks))(keys), (), jnp.int32(0))
 
-    return Ensemble(states, update)
+    def update(state: State, frozen: Params, batches: ComparisonBatch) -> tuple[State, Metrics]:
+        states, metrics = jax.lax.map(lambda each: learner.update(each[0], frozen, each[1]), (state.trained, batches))
+        return State(states, (), state.step + 1), metrics
+
+    def evaluate(state: State, frozen: Params, batches: ComparisonBatch) -> Metrics:
+        found: Metrics = jax.lax.map(lambda each: learner.evaluate(each[0], frozen, each[1]), (state.trained, batches))
+        return found
+
+    def params(state: State, frozen: Params) -> list[Params]:
+        return [learner.params(_member(state.trained, number), frozen) for number in range(members)]
+
+    return Learner(init, update, evaluate, params, learner.frozen)
 
 
-def fit(
-    learner: Learner, config: Config, params: Params, data: ComparisonData, *, members: int = 1, seed: int = 0, log: Log | None = None
-) -> list[Params]:
-    """The parameters of each member after ``config.total_steps`` steps, in passes over the data, each member's in an order of its own.
+def passes(data: ComparisonData, config: Config, members: int, seed: int) -> Callable[[int, State], ComparisonBatch]:
+    """The batch of a step, of every member: in passes over the data, each member's in an order of its own.
 
     Raises ``UserError`` where there are fewer comparisons than a step takes.
     """
     rows = len(data.valid)
     if rows < config.batch_size:
         raise UserError(f"{rows} comparisons do not fill a batch of batch_size = {config.batch_size}: lower it")
-    fitted, frozen = ensemble(learner, params, members, seed), learner.frozen(params)
-    states = fitted.states
     orders = [_order(np.random.default_rng([seed, member]), rows, config) for member in range(members)]
+    return lambda step, state: data.rows(np.stack([order[step] for order in orders]))
+
+
+def fit(
+    learner: Learner, config: Config, params: Params, data: ComparisonData, *, members: int = 1, seed: int = 0, log: Log | None = None
+) -> list[Params]:
+    """The parameters of each member after ``config.total_steps`` steps. Raises ``UserError`` where ``passes`` does."""
+    batch, joint = passes(data, config, members, seed), as_one(learner, members)
+    state, frozen, update = joint.init(params, jax.random.key(seed)), joint.frozen(params), jax.jit(joint.update, donate_argnums=0)
     for step in range(config.total_steps):
-        chosen = np.stack([order[step] for order in orders])
-        states, metrics = fitted.update(states, frozen, data.rows(chosen))
+        state, metrics = update(state, frozen, batch(step, state))
         if log is not None:
             log(step + 1, {name: np.asarray(value).tolist() for name, value in metrics.items()})
-    return [learner.params(_member(states, number), params) for number in range(members)]
+    return list(joint.params(state, params))
 
 
 def steps_of_an_epoch(rows: int, batch_size: int, epochs: int = 1) -> int:

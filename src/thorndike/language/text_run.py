@@ -4,9 +4,10 @@ The directory: ``run.json`` (what was asked for), ``metrics.jsonl`` and TensorBo
 that is given again goes on where it stopped.
 """
 
+import hashlib
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import NamedTuple
@@ -54,20 +55,37 @@ class TextOutcome(NamedTuple):
     cpu_s: float
 
 
-def open_run(run: Path, request: Mapping[str, object]) -> None:
-    """Make a run's directory, or find it there with the same request. Raises ``UserError`` for another one."""
+def open_run(run: Path, request: Mapping[str, object], files: Sequence[Path] = ()) -> None:
+    """Make a run's directory, or find it there with the same request, and ``files`` of data with the same content.
+
+    Raises ``UserError`` for another request, and for a file that has changed; runs of older versions do not know what was in them.
+    """
     asked = json.loads(json.dumps(request))
     if not (run / "run.json").exists():
         if run.exists() and any(run.iterdir()):
             raise UserError(f"{run} is there already and is no run: choose another folder")
         run.mkdir(parents=True, exist_ok=True)
-        write_json(run / "run.json", facts() | {"kind": "language", "request": asked})
+        write_json(run / "run.json", facts() | {"kind": "language", "request": asked, "files": _digests(files)})
         return
-    before = read_run(run).get("request")
+    found = read_run(run)
+    before, known = found.get("request"), found.get("files")
+    if isinstance(known, dict):  # First, because settings that are left out follow from the number of rows.
+        for name, digest in _digests(files).items():
+            if known.get(name, digest) != digest:
+                raise UserError(f"{name} has changed since {run} was begun: put back what was in it to go on, or choose another folder")
     if before != asked:
         old = before if isinstance(before, dict) else {}
         changed = sorted(name for name in {*old, *asked} if old.get(name) != asked.get(name))
         raise UserError(f"{run} was begun with another {', '.join(changed)}: give what it was begun with to go on, or another folder")
+
+
+def _digests(files: Sequence[Path]) -> dict[str, str]:
+    """Each file's absolute path -> the SHA-256 of its content."""
+    found = {}
+    for path in files:
+        with path.open("rb") as file:
+            found[str(path.absolute())] = hashlib.file_digest(file, "sha256").hexdigest()
+    return found
 
 
 def run_learner(

@@ -63,7 +63,7 @@ def run_policy_verb(verb: str, summary: str, words: Sequence[str]) -> Answer:
     add_training_arguments(parser)
     parser.add_argument("--reward", action="append", required=True, metavar="WHAT", help="WHAT or WEIGHT*WHAT; several are summed")
     parser.add_argument("--prompts", type=Path, action="append", required=True, metavar="FILE", help="rows with a column prompt")
-    parser.add_argument("--max-kl", type=_positive, metavar="NATS", help="stop beyond, and keep the last policy that was not")
+    parser.add_argument("--max-kl", type=above_zero, metavar="NATS", help="stop beyond, and keep the last policy that was not")
     parser.add_argument("--no-limits", action="store_true", help="do not stop on disagreement, repetition or changed length either")
     options = parse_with_config(parser, words, verb, module)
     settings = given_settings(options.settings, module)
@@ -114,7 +114,8 @@ def in_words(found: "Comparison") -> str:
     return "\n".join(lines)
 
 
-def _positive(text: str) -> float:
+def above_zero(text: str) -> float:
+    """A finite number above 0."""
     import argparse
     import math
 

@@ -15,7 +15,7 @@ from thorndike.errors import UserError
 from thorndike.settings import FieldFacts, parse_settings
 from thorndike.suggestions import did_you_mean
 
-STEPS = ("pretrain", "sft", "reward", "ppo", "grpo", "rloo", "dpo", "eval")
+STEPS = ("pretrain", "sft", "reward", "ppo", "grpo", "rloo", "dpo", "eval", "generate", "label", "chat")
 """The verbs that read such a file."""
 _FLAG = "--config"
 _NOT_IN_A_FILE = ("help", "json", "config", "settings")

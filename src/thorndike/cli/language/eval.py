@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from thorndike.cli.answer import Answer
-from thorndike.cli.language.aligning import comparison_data, in_words
+from thorndike.cli.language.aligning import above_zero, comparison_data, in_words
 from thorndike.cli.language.arguments import add_device_argument, add_ignore_eos_argument, prepare_device
 from thorndike.cli.language.config_file import parse_with_config
 from thorndike.cli.parser import Parser, positive_whole, seed_number
@@ -23,7 +23,7 @@ def run(words: Sequence[str]) -> Answer:
     parser.add_argument("--reward", action="append", required=True, metavar="WHAT", help="a score; each is reported on its own")
     parser.add_argument("--max-new-tokens", type=positive_whole, default=64, metavar="N", help="at most (default: 64)")
     add_ignore_eos_argument(parser)
-    parser.add_argument("--temperature", type=float, default=1.0, metavar="T", help="of both (default: 1)")
+    parser.add_argument("--temperature", type=above_zero, default=1.0, metavar="T", help="of both (default: 1)")
     parser.add_argument("--seed", type=seed_number, default=0, help="the number that all texts follow from (default: 0)")
     add_device_argument(parser)
     options = parse_with_config(parser, words, "eval", None)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, cast
 
 from thorndike.cli.answer import Answer, printable
 from thorndike.cli.language.arguments import add_ignore_eos_argument, add_model_argument, add_sampling_arguments, prepare_device
+from thorndike.cli.language.config_file import parse_with_config
 from thorndike.cli.parser import Parser, positive_whole, seed_number
 from thorndike.errors import UserError
 
@@ -34,7 +35,7 @@ def run(words: Sequence[str]) -> Answer:
     parser.add_argument("--batch-size", type=positive_whole, default=64, metavar="N", help="prompts at a time (default: 64)")
     parser.add_argument("--reward", action="append", default=[], metavar="WHAT", help="keep the best of a prompt's samples by this reward")
     parser.add_argument("--to", type=Path, metavar="FILE", help="write them there, one JSON object with prompt and completions a line")
-    options = parser.parse(words)
+    options = parse_with_config(parser, words, "generate", None)
     if not options.prompt and options.prompts is None:
         raise UserError("generate needs prompts: --prompt TEXT, or --prompts FILE")
     if options.to is not None and options.to.exists():

@@ -30,7 +30,7 @@ def run(words: Sequence[str]) -> Answer:
     parser.add_argument("--seed", type=seed_number, default=0, help="what the draw of those items follows from (default: 0)")
     options = parser.parse(words)
     guidelines = None if options.guidelines is None else _text(options.guidelines)
-    with opened_store(options.db) as store:
+    with opened_store(options.db, new=True) as store:
         from thorndike.language.preferences.assignment import Plan
         from thorndike.language.preferences.formats import import_records
         from thorndike.language.preferences.records import read_records

@@ -7,6 +7,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from thorndike.cli.answer import Answer
+from thorndike.cli.language.config_file import parse_with_config
 from thorndike.cli.language.preference_store import add_store_arguments, existing_project, media_folder, opened_store, share
 from thorndike.cli.parser import Parser, seed_number
 from thorndike.cli.studio import port_number
@@ -34,7 +35,7 @@ def run(words: Sequence[str]) -> Answer:
     parser.add_argument("--seed", type=seed_number, default=0, help="what sides and draws follow from (default: 0)")
     simulate_help = "no page: a simulated crowd (8 fair, 3 who guess, 1 the wrong way round) judges by a function of prompt and candidate"
     parser.add_argument("--simulate", metavar="FILE.py:FUNCTION", help=simulate_help)
-    options = parser.parse(words)
+    options = parse_with_config(parser, words, "label", None)
     if options.simulate is not None:
         return _simulate(options.db, options.project, options.simulate, (options.gold, options.repeats, options.seed))
     if find_spec("nicegui") is None:

@@ -24,10 +24,13 @@ def add_store_arguments(parser: Parser) -> None:
 
 
 @contextmanager
-def opened_store(where: str) -> Iterator["Store"]:
-    """The store, made where there is none. Raises ``UserError`` where SQLAlchemy is missing, or it cannot be opened."""
+def opened_store(where: str, new: bool = False) -> Iterator["Store"]:
+    """The store; ``new``: made where there is none. Raises ``UserError`` where SQLAlchemy is missing, or it cannot be opened."""
     if find_spec("sqlalchemy") is None:
         raise UserError("preferences need SQLAlchemy, which is not installed: pip install 'thorndike[language]'")
+    if not new and "://" not in where and Path(where).parent.is_dir() and not Path(where).exists():
+        # SQLite would make an empty file of a name that was mistyped.
+        raise UserError(f"there is no store {where}; put something in: thorndike language import FILE --db {where}")
     from thorndike.language.preferences.store import Store
 
     with Store(where) as store:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from thorndike.cli.answer import Answer
-from thorndike.cli.language.aligning import add_training_arguments, lora_of, teller
+from thorndike.cli.language.aligning import add_training_arguments, lora_of
 from thorndike.cli.language.arguments import given_settings, prepare_device, settings_in_words, sharing
 from thorndike.cli.language.config_file import parse_with_config
 from thorndike.cli.parser import Parser, positive_whole
@@ -12,7 +12,7 @@ from thorndike.cli.parser import Parser, positive_whole
 EXAMPLES = """\
   thorndike language reward MODEL --data preferences.jsonl --out runs/reward
   thorndike language reward MODEL --data preferences.jsonl --out runs/reward --members 3 --set pool=mean
-Without total_steps it is one pass over the data. Settings:
+The same command again goes on where it stopped. Without total_steps it is one pass over the data. Settings:
 {settings}"""
 
 
@@ -31,17 +31,13 @@ def run(words: Sequence[str]) -> Answer:
     prepare_device(options.device, options.model, options.devices)
     from thorndike.language.aligning import train_reward_model
 
-    show = teller()
-
-    def log(step: int, metrics: dict[str, list[float]]) -> None:
-        if show is not None:
-            show(f"{step}: loss {metrics['train/loss'][0]:.4f}, accuracy {metrics['train/accuracy'][0]:.3f}")
-
     with sharing(options.devices):
         found = train_reward_model(
             options.model, options.data, options.held_out, options.out, settings, members=options.members, seed=options.seed,
-            lora=lora_of(options.lora), dtype=options.dtype, log=log,
+            lora=lora_of(options.lora), dtype=options.dtype,
         )  # fmt: skip
+    if found is None:
+        return Answer({"run": options.out, "status": "interrupted"}, "interrupted\nthe same command again goes on from here", 130)
     low, high = found.accuracy_ci95
     lines = [
         f"right on {found.accuracy:.1%} [{low:.1%}, {high:.1%}] of {found.pairs} held-out pairs; "
@@ -51,5 +47,5 @@ def run(words: Sequence[str]) -> Answer:
     ]
     if found.near_chance:
         lines.append("that is near chance: no policy is trained on it; give it more comparisons, or train it longer")
-    data = {"run": options.out, "model": options.out / "model", **found._asdict(), "near_chance": found.near_chance}
+    data = {"run": options.out, "status": "finished", "model": options.out / "model", **found._asdict(), "near_chance": found.near_chance}
     return Answer(data | {"by_gap": [each._asdict() for each in found.by_gap]}, "\n".join(lines))
