@@ -1,7 +1,6 @@
 """A game learnt for a stated time, and how strong its checkpoints are in a pool with random moves, plain tree search and an engine.
 
 python benchmarks/curve.py go_9x9 --budget 90    into benchmarks/results/curve.json and docs/images/curve_go_9x9.png
-python benchmarks/curve.py chess --budget 90
 
 CPU-seconds are those of playing and learning on one core, compiling left out. Everybody plays everybody, from random openings
 that are played twice with colours swapped; ratings are fitted to all games at once, and the random player's is set to 0.
@@ -58,13 +57,6 @@ PLANS = {
         ("random", "mcts:4", "gnugo:level=1"),
         4,
         120_000,
-    ),
-    "chess": Plan(
-        32,
-        {**SHARED, "tower": "mlp", "width": 128, "learning_starts": 3_000, "temperature_moves": 30, "num_simulations": 12},
-        ("random", "stockfish:skill=0,nodes=1"),
-        4,
-        60_000,
     ),
 }
 
