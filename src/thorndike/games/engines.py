@@ -11,6 +11,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple
 
 from thorndike.errors import UserError
+from thorndike.games.registry import FOR_ONE, WITH_DICE
 from thorndike.suggestions import did_you_mean
 
 if TYPE_CHECKING:
@@ -129,7 +130,8 @@ def check_engine(text: str, game: str) -> None:
         found = ENGINES[name]
         read_settings(name, rest, {**found.settings, **LIMIT})
         if game not in found.games:
-            raise UserError(f"{name} plays {' and '.join(found.games)}, not {game}; here play random, mcts and trained runs")
+            others = "random and" if game in (*FOR_ONE, *WITH_DICE) else "random, mcts and"
+            raise UserError(f"{name} plays {' and '.join(found.games)}, not {game}; there play {others} trained runs")
         program_of(found)
 
 
