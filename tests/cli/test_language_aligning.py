@@ -1,6 +1,7 @@
 """The verbs that learn from preferences and rewards: what they answer, what they leave behind, mistakes in one line."""
 
 import json
+import shutil
 import signal
 from pathlib import Path
 
@@ -12,11 +13,13 @@ from thorndike.cli.main import main
 from thorndike.language import aligning
 from thorndike.language.decoder import initial_params
 from thorndike.language.model import LanguageModel, load_model, save_model
+from thorndike.language.preference_files import read_prompts
 from thorndike.language.preferences.assignment import Plan, next_assignments
 from thorndike.language.preferences.store import Store
 from thorndike.language.pretraining import Config, small_llama, train_tokenizer
 from thorndike.language.reward_files import load_reward_model
 from thorndike.language.reward_training import passes
+from thorndike.language.rollouts import make_prompts
 
 pytestmark = pytest.mark.usefixtures("quick_compile")
 SMALL = ["--set=episodes=8", "--set=batch_size=4", "--set=max_new_tokens=4", "--set=max_prompt_length=12", "--set=total_steps=2"]
@@ -174,6 +177,24 @@ def test_people_are_asked_first_where_the_members_disagree(folder: Path, reward:
         most = store.questions(project)[max(by_hand, key=lambda number: by_hand[number])]
         wanted = {candidates[each].content["text"] for each in most.candidates}
         assert {each["text"] for each in shown.candidates} == wanted
+
+
+def test_prompts_may_be_conversations(folder: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    rows: list[dict] = [{"prompt": [{"role": "user", "content": "The film"}]}, {"prompt": "The play"}]
+    (tmp_path / "prompts.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    words = ["--prompts", str(tmp_path / "prompts.jsonl"), "--reward", f"{folder}/rewards.py:length", "--max-new-tokens", "4"]
+    assert main(["language", "eval", str(folder / "base"), "--base", str(folder / "base"), *words]) == 2
+    assert "this model has no chat template" in capsys.readouterr().err
+    shutil.copytree(folder / "base", tmp_path / "chat")
+    template = "<s>{% for each in messages %}{{ each.role }}: {{ each.content }}{% endfor %}{% if add_generation_prompt %}|{% endif %}"
+    (tmp_path / "chat" / "chat_template.jinja").write_text(template)
+    found = answer(capsys, "eval", str(tmp_path / "chat"), "--base", str(tmp_path / "chat"), *words)
+    assert found["prompts"] == 2
+    tokenizer = load_model(tmp_path / "chat").tokenizer
+    prompts = make_prompts(read_prompts([tmp_path / "prompts.jsonl"]), tokenizer, 24)
+    tokens = [row[kept > 0].tolist() for row, kept in zip(prompts.tokens, prompts.segments, strict=True)]
+    assert tokens == [tokenizer.encode("user: The film|"), tokenizer.encode("The play")], "one beginning of text each"
+    assert prompts.texts == ("<s>user: The film|", "The play")
 
 
 def test_mistakes_are_one_line(folder: Path, reward: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

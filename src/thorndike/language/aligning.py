@@ -15,6 +15,7 @@ from thorndike.language import grpo as groups
 from thorndike.language import ppo as proximal
 from thorndike.language.best_of_n import best, sample_many
 from thorndike.language.comparisons import ComparisonData, comparison_data
+from thorndike.language.data import prompts_tokens
 from thorndike.language.json_fields import Dtype
 from thorndike.language.learner import State
 from thorndike.language.lora import LoraConfig
@@ -214,7 +215,7 @@ def compare_folders(
     if jax.tree.map(jnp.shape, first.params) != jax.tree.map(jnp.shape, second.params):
         raise UserError(f"{policy} is not of the shape of {base}: their divergence has no meaning; compare a policy with what it began as")
     texts = read_prompts(prompts)
-    width = max(len(tokens) for tokens in first.tokenizer.encode_many(texts))
+    width = max(map(len, prompts_tokens(texts, first.tokenizer)))
     named = {each.what: load_rewards([each], first).score for each in scores}
     return compare_with_base(
         first, second.params, make_prompts(texts, first.tokenizer, width), named, max_new_tokens=max_new_tokens, temperature=temperature,
