@@ -6,12 +6,13 @@ import signal
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from thorndike.cli.main import main
 from thorndike.language import aligning
-from thorndike.language.decoder import initial_params
+from thorndike.language.decoder import hidden_states, initial_params, logits
 from thorndike.language.model import LanguageModel, load_model, save_model
 from thorndike.language.preference_files import read_prompts
 from thorndike.language.preferences.assignment import Plan, next_assignments
@@ -103,13 +104,24 @@ def test_a_run_whose_data_have_changed_is_not_gone_on_with(
 def test_a_policy_is_trained_on_it_and_compared(verb: str, folder: Path, reward: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = folder / verb
     words = [verb, str(folder / "base"), "--reward", str(reward), "--reward", f"0.1*{folder}/rewards.py:length", "--out", str(out)]
-    words += ["--prompts", str(folder / "prompts.jsonl"), "--max-kl", "50", *SMALL, *(["--set=group=4"] if verb == "rloo" else [])]
+    words += [
+        "--prompts",
+        str(folder / "prompts.jsonl"),
+        "--max-kl",
+        "50",
+        *SMALL,
+        *(["--set=group=4", "--lora=2", "--set=learning_rate=0.01"] if verb == "rloo" else []),
+    ]
     found = answer(capsys, *words)
     assert found["iterations"] == 2 and found["stopped"] is None and 0.0 <= found["judged"]["reward"]["win_rate"] <= 1.0
     assert load_model(out / "model").config == load_model(folder / "base").config
     assert len((out / "metrics.jsonl").read_text().splitlines()) == 2 and json.loads((out / "comparison.json").read_text())["samples"]
     assert answer(capsys, *words) == found  # the same command finds it done
     assert list(json.loads((out / "run.json").read_text())["files"]) == [str(folder / "prompts.jsonl")]
+    if verb == "rloo":
+        assert_adapter_makes_the_model(folder, out)
+    else:
+        assert not (out / "adapter").exists()
 
 
 def test_no_text_ends_where_the_policy_is_told_so(folder: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -117,6 +129,21 @@ def test_no_text_ends_where_the_policy_is_told_so(folder: Path, capsys: pytest.C
     found = answer(capsys, *words, "--out", str(tmp_path / "ppo"), *SMALL, "--set=ignore_eos=true")
     assert found["length"] == found["base_length"] == 4.0
     assert load_model(tmp_path / "ppo" / "model").config == load_model(folder / "base").config
+
+
+def assert_adapter_makes_the_model(folder: Path, run: Path) -> None:
+    """Merged into the base, it says what the saved model says, and the base does not."""
+    tokens = jnp.asarray([load_model(folder / "base").tokenizer.encode("The film is good.")])
+    models = [load_model(folder / "base", adapter=run / "adapter"), load_model(run / "model"), load_model(folder / "base")]
+    said = [np.asarray(logits(each.params, each.config, hidden_states(each.params, each.config, tokens))) for each in models]
+    np.testing.assert_allclose(said[0], said[1], rtol=1e-5, atol=1e-6)
+    assert np.abs(said[1] - said[2]).max() > 1e-4
+
+
+def test_an_adapter_learnt_from_preferences_is_kept_apart_too(folder: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    words = ["dpo", str(folder / "base"), "--data", str(folder / "preferences.jsonl"), "--out", str(tmp_path), "--lora", "2"]
+    answer(capsys, *words, "--set=batch_size=8", "--set=learning_rate=0.01", "--set=total_steps=4")
+    assert_adapter_makes_the_model(folder, tmp_path)
 
 
 def test_dpo_and_eval(folder: Path, reward: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -18,7 +18,7 @@ from thorndike.language.comparisons import ComparisonData, comparison_data
 from thorndike.language.data import prompts_tokens
 from thorndike.language.json_fields import Dtype
 from thorndike.language.learner import State
-from thorndike.language.lora import LoraConfig
+from thorndike.language.lora import Adapter, LoraConfig, save_adapter
 from thorndike.language.model import LanguageModel, computing_in, load_model, never_ending, precision, save_model
 from thorndike.language.over_optimisation import Limits
 from thorndike.language.policy_learner import PolicyLearner
@@ -31,7 +31,7 @@ from thorndike.language.reward_report import HeldOut
 from thorndike.language.reward_training import as_one, passes, report_on, scores_of
 from thorndike.language.rewards import Score, model_score, weighted_sum
 from thorndike.language.rollouts import Written, make_prompts
-from thorndike.language.text_run import MODEL, TextOutcome, TextPlan, open_run, run_learner
+from thorndike.language.text_run import ADAPTER, MODEL, TextOutcome, TextPlan, open_run, run_learner
 from thorndike.language.win_rate import Comparison, compare_with_base
 from thorndike.settings import settings_of
 from thorndike.training.run_directory import write_json
@@ -168,6 +168,8 @@ def align(
     )
     write_json(out / "comparison.json", as_json(found))
     if not (out / MODEL).exists():
+        if lora is not None and outcome.adapter is not None:
+            save_adapter(Adapter(lora, outcome.adapter), plain.config, out / ADAPTER, str(folder.absolute()))
         save_model(plain._replace(params=outcome.params), out / MODEL)
     return outcome, found
 
@@ -198,6 +200,8 @@ def align_by_preferences(
     plan = TextPlan(config.total_steps, log_every=max(1, config.total_steps // 100), checkpoint_every=max(1, config.total_steps // 5))
     outcome = run_learner(out, learner, base.params, batch, plan, seed, progress=progress)
     if outcome.status == "finished" and not (out / MODEL).exists():
+        if lora is not None:
+            save_adapter(Adapter(lora, outcome.state.trained), plain.config, out / ADAPTER, str(folder.absolute()))
         save_model(plain._replace(params=learner.params(outcome.state, learner.frozen(base.params))), out / MODEL)
     return outcome
 
