@@ -157,8 +157,10 @@ def test_dpo_and_eval(folder: Path, reward: Path, capsys: pytest.CaptureFixture[
     same = answer(capsys, "dpo", "--config", str(folder / "way.toml"), "--set=total_steps=12")
     assert same["steps"] == 12, "a file that says the same is the same request, which is done"
     words = ["eval", str(folder / "dpo" / "model"), "--base", str(folder / "base"), "--prompts", str(folder / "prompts.jsonl")]
-    seen = answer(capsys, *words, "--reward", str(reward), "--reward", f"{folder}/rewards.py:length", "--max-new-tokens", "4")
-    assert seen["kl"] > 0.01 and set(seen["judged"]) == {str(reward), f"{folder}/rewards.py:length"} and seen["prompts"] == 4
+    length = f"{folder}/rewards.py:length"
+    seen = answer(capsys, *words, "--reward", str(reward), "--reward", length, "--reward", f"0.5*{length}", "--max-new-tokens", "4")
+    assert seen["kl"] > 0.01 and set(seen["judged"]) == {str(reward), length, f"0.5*{length}"} and seen["prompts"] == 4
+    assert seen["judged"][f"0.5*{length}"]["policy"] == pytest.approx(seen["judged"][length]["policy"] / 2)
 
 
 def test_the_best_samples_are_learnt_from(folder: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -230,12 +232,18 @@ def test_mistakes_are_one_line(folder: Path, reward: Path, capsys: pytest.Captur
     (tmp_path / "same.jsonl").write_text('{"prompt": "a", "chosen": "b", "rejected": "b"}\n')
     (tmp_path / "odd.jsonl").write_text('{"prompt": "a", "chosen": "b", "rejected": "c", "p_chosen": 2}\n')
     (tmp_path / "wrong.py").write_text("def score(prompts, completions, ids):\n    return 1.0\n")
+    (tmp_path / "raising.py").write_text("def score(prompts, completions, ids):\n    return [int('a\\nb')]\n")
     cases = [
         ([*ppo, "--reward", "nowhere"], "is no reward"),
         ([*ppo, "--reward", "x*nowhere"], "WEIGHT*WHAT"),
         ([*ppo, "--reward", f"{folder}/rewards.py:width"], "no function width"),
         ([*ppo, "--reward", base], "without a scalar head"),
         ([*ppo, "--reward", f"{tmp_path}/wrong.py:score"], "a number a text"),
+        (
+            [*ppo, "--reward", f"2*{tmp_path}/raising.py:score", "--out", str(tmp_path / "w")],
+            f"the reward {tmp_path}/raising.py:score failed: ValueError: invalid literal for int() with base 10: 'a\\nb' "
+            f"({tmp_path}/raising.py, line 2)",
+        ),
         ([*ppo, "--reward", str(reward), "--max-kl", "-1"], "above 0"),
         ([*ppo, "--reward", str(reward), "--set", "target_kll=3"], "did you mean"),
         (["rloo", *ppo[1:], "--reward", str(reward), "--set", "baseline=group"], "thorndike language grpo"),
@@ -245,6 +253,7 @@ def test_mistakes_are_one_line(folder: Path, reward: Path, capsys: pytest.Captur
         (["dpo", base, "--data", str(tmp_path / "odd.jsonl"), "--out", str(tmp_path / "y")], "odd.jsonl, row 1: p_chosen is 2"),
         (["reward", base, "--data", prompts, "--out", str(tmp_path / "y")], "expected a preference"),
         (["eval", str(reward), "--base", base, "--prompts", prompts, "--reward", str(reward)], "not of the shape"),
+        (["eval", base, "--base", base, "--prompts", prompts, "--reward", str(reward), "--reward", str(reward)], "given twice"),
         (["ask", "--db", str(folder / "p.db"), "--reward", str(reward)], "there is no store"),
         (["eval", base, "--base", base, "--prompts", prompts, "--reward", str(reward), "--temperature", "0"], "above 0"),
         ([*reward_words(folder), "--lora", "2"], "begun with another lora"),

@@ -29,7 +29,7 @@ from thorndike.language.reward_model import Config as RewardConfig
 from thorndike.language.reward_model import reward_model
 from thorndike.language.reward_report import HeldOut
 from thorndike.language.reward_training import as_one, passes, report_on, scores_of
-from thorndike.language.rewards import Score, model_score, weighted_sum
+from thorndike.language.rewards import Score, function_score, model_score, weighted_sum
 from thorndike.language.rollouts import Written, make_prompts
 from thorndike.language.text_run import ADAPTER, MODEL, TextOutcome, TextPlan, open_run, run_learner
 from thorndike.language.win_rate import Comparison, compare_with_base
@@ -64,6 +64,11 @@ def parse_reward(text: str) -> Reward:
         return Reward(float(weight) if star else 1.0, what)
     except ValueError:
         raise UserError(f"a reward is WHAT or WEIGHT*WHAT, such as 0.5*runs/reward/model; got '{text}'") from None
+
+
+def _named(part: Reward) -> str:
+    """What was asked for, in the words of ``parse_reward``."""
+    return part.what if part.weight == 1.0 else f"{part.weight}*{part.what}"
 
 
 def load_rewards(parts: Sequence[Reward], base: LanguageModel) -> Rewards:
@@ -220,7 +225,9 @@ def compare_folders(
         raise UserError(f"{policy} is not of the shape of {base}: their divergence has no meaning; compare a policy with what it began as")
     texts = read_prompts(prompts)
     width = max(map(len, prompts_tokens(texts, first.tokenizer)))
-    named = {each.what: load_rewards([each], first).score for each in scores}
+    named = {_named(each): load_rewards([each], first).score for each in scores}
+    if len(named) < len(scores):
+        raise UserError("a --reward is given twice: each is reported on its own, so give it once")
     return compare_with_base(
         first, second.params, make_prompts(texts, first.tokenizer, width), named, max_new_tokens=max_new_tokens, temperature=temperature,
         seed=seed,
@@ -300,4 +307,5 @@ def _function(name: str) -> Score:
     function = getattr(module, attribute, None)
     if not callable(function):
         raise UserError(f"{name}: there is no function {attribute}; it must take prompts, completions and ids, and return a number a text")
-    return cast(Score, function)
+    file = getattr(module, "__file__", None)
+    return function_score(cast(Score, function), name, None if file is None else Path(file))
