@@ -3,6 +3,7 @@
 import importlib
 import importlib.util
 import sys
+import traceback
 from pathlib import Path
 from types import ModuleType
 
@@ -52,6 +53,12 @@ def import_module(module: str, name: str, form: str) -> ModuleType:
     except (Exception, SystemExit) as error:
         # Whatever a module raises, or its name, is about what was asked for.
         raise UserError(f"{module} of {name} cannot be imported: {type(error).__name__}: {one_line(error)}") from error
+
+
+def place_in(file: Path | None, error: BaseException) -> str:
+    """`` (FILE, line N)``: the last line of a file that an error came through; nothing where it came through none of the file's."""
+    frames = [] if file is None else [each for each in traceback.extract_tb(error.__traceback__) if Path(each.filename) == file]
+    return f" ({file}, line {frames[-1].lineno})" if frames else ""
 
 
 def one_line(error: BaseException) -> str:

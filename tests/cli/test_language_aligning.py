@@ -1,22 +1,26 @@
 """The verbs that learn from preferences and rewards: what they answer, what they leave behind, mistakes in one line."""
 
 import json
+import shutil
 import signal
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from thorndike.cli.main import main
 from thorndike.language import aligning
-from thorndike.language.decoder import initial_params
+from thorndike.language.decoder import hidden_states, initial_params, logits
 from thorndike.language.model import LanguageModel, load_model, save_model
+from thorndike.language.preference_files import read_prompts
 from thorndike.language.preferences.assignment import Plan, next_assignments
 from thorndike.language.preferences.store import Store
 from thorndike.language.pretraining import Config, small_llama, train_tokenizer
 from thorndike.language.reward_files import load_reward_model
 from thorndike.language.reward_training import passes
+from thorndike.language.rollouts import make_prompts
 
 pytestmark = pytest.mark.usefixtures("quick_compile")
 SMALL = ["--set=episodes=8", "--set=batch_size=4", "--set=max_new_tokens=4", "--set=max_prompt_length=12", "--set=total_steps=2"]
@@ -100,13 +104,24 @@ def test_a_run_whose_data_have_changed_is_not_gone_on_with(
 def test_a_policy_is_trained_on_it_and_compared(verb: str, folder: Path, reward: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = folder / verb
     words = [verb, str(folder / "base"), "--reward", str(reward), "--reward", f"0.1*{folder}/rewards.py:length", "--out", str(out)]
-    words += ["--prompts", str(folder / "prompts.jsonl"), "--max-kl", "50", *SMALL, *(["--set=group=4"] if verb == "rloo" else [])]
+    words += [
+        "--prompts",
+        str(folder / "prompts.jsonl"),
+        "--max-kl",
+        "50",
+        *SMALL,
+        *(["--set=group=4", "--lora=2", "--set=learning_rate=0.01"] if verb == "rloo" else []),
+    ]
     found = answer(capsys, *words)
     assert found["iterations"] == 2 and found["stopped"] is None and 0.0 <= found["judged"]["reward"]["win_rate"] <= 1.0
     assert load_model(out / "model").config == load_model(folder / "base").config
     assert len((out / "metrics.jsonl").read_text().splitlines()) == 2 and json.loads((out / "comparison.json").read_text())["samples"]
     assert answer(capsys, *words) == found  # the same command finds it done
     assert list(json.loads((out / "run.json").read_text())["files"]) == [str(folder / "prompts.jsonl")]
+    if verb == "rloo":
+        assert_adapter_makes_the_model(folder, out)
+    else:
+        assert not (out / "adapter").exists()
 
 
 def test_no_text_ends_where_the_policy_is_told_so(folder: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -114,6 +129,21 @@ def test_no_text_ends_where_the_policy_is_told_so(folder: Path, capsys: pytest.C
     found = answer(capsys, *words, "--out", str(tmp_path / "ppo"), *SMALL, "--set=ignore_eos=true")
     assert found["length"] == found["base_length"] == 4.0
     assert load_model(tmp_path / "ppo" / "model").config == load_model(folder / "base").config
+
+
+def assert_adapter_makes_the_model(folder: Path, run: Path) -> None:
+    """Merged into the base, it says what the saved model says, and the base does not."""
+    tokens = jnp.asarray([load_model(folder / "base").tokenizer.encode("The film is good.")])
+    models = [load_model(folder / "base", adapter=run / "adapter"), load_model(run / "model"), load_model(folder / "base")]
+    said = [np.asarray(logits(each.params, each.config, hidden_states(each.params, each.config, tokens))) for each in models]
+    np.testing.assert_allclose(said[0], said[1], rtol=1e-5, atol=1e-6)
+    assert np.abs(said[1] - said[2]).max() > 1e-4
+
+
+def test_an_adapter_learnt_from_preferences_is_kept_apart_too(folder: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    words = ["dpo", str(folder / "base"), "--data", str(folder / "preferences.jsonl"), "--out", str(tmp_path), "--lora", "2"]
+    answer(capsys, *words, "--set=batch_size=8", "--set=learning_rate=0.01", "--set=total_steps=4")
+    assert_adapter_makes_the_model(folder, tmp_path)
 
 
 def test_dpo_and_eval(folder: Path, reward: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -127,8 +157,10 @@ def test_dpo_and_eval(folder: Path, reward: Path, capsys: pytest.CaptureFixture[
     same = answer(capsys, "dpo", "--config", str(folder / "way.toml"), "--set=total_steps=12")
     assert same["steps"] == 12, "a file that says the same is the same request, which is done"
     words = ["eval", str(folder / "dpo" / "model"), "--base", str(folder / "base"), "--prompts", str(folder / "prompts.jsonl")]
-    seen = answer(capsys, *words, "--reward", str(reward), "--reward", f"{folder}/rewards.py:length", "--max-new-tokens", "4")
-    assert seen["kl"] > 0.01 and set(seen["judged"]) == {str(reward), f"{folder}/rewards.py:length"} and seen["prompts"] == 4
+    length = f"{folder}/rewards.py:length"
+    seen = answer(capsys, *words, "--reward", str(reward), "--reward", length, "--reward", f"0.5*{length}", "--max-new-tokens", "4")
+    assert seen["kl"] > 0.01 and set(seen["judged"]) == {str(reward), length, f"0.5*{length}"} and seen["prompts"] == 4
+    assert seen["judged"][f"0.5*{length}"]["policy"] == pytest.approx(seen["judged"][length]["policy"] / 2)
 
 
 def test_the_best_samples_are_learnt_from(folder: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -176,18 +208,42 @@ def test_people_are_asked_first_where_the_members_disagree(folder: Path, reward:
         assert {each["text"] for each in shown.candidates} == wanted
 
 
+def test_prompts_may_be_conversations(folder: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    rows: list[dict] = [{"prompt": [{"role": "user", "content": "The film"}]}, {"prompt": "The play"}]
+    (tmp_path / "prompts.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    words = ["--prompts", str(tmp_path / "prompts.jsonl"), "--reward", f"{folder}/rewards.py:length", "--max-new-tokens", "4"]
+    assert main(["language", "eval", str(folder / "base"), "--base", str(folder / "base"), *words]) == 2
+    assert "this model has no chat template" in capsys.readouterr().err
+    shutil.copytree(folder / "base", tmp_path / "chat")
+    template = "<s>{% for each in messages %}{{ each.role }}: {{ each.content }}{% endfor %}{% if add_generation_prompt %}|{% endif %}"
+    (tmp_path / "chat" / "chat_template.jinja").write_text(template)
+    found = answer(capsys, "eval", str(tmp_path / "chat"), "--base", str(tmp_path / "chat"), *words)
+    assert found["prompts"] == 2
+    tokenizer = load_model(tmp_path / "chat").tokenizer
+    prompts = make_prompts(read_prompts([tmp_path / "prompts.jsonl"]), tokenizer, 24)
+    tokens = [row[kept > 0].tolist() for row, kept in zip(prompts.tokens, prompts.segments, strict=True)]
+    assert tokens == [tokenizer.encode("user: The film|"), tokenizer.encode("The play")], "one beginning of text each"
+    assert prompts.texts == ("<s>user: The film|", "The play")
+
+
 def test_mistakes_are_one_line(folder: Path, reward: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     base, prompts = str(folder / "base"), str(folder / "prompts.jsonl")
     ppo = ["ppo", base, "--prompts", prompts, "--out", str(tmp_path / "x"), *SMALL]
     (tmp_path / "same.jsonl").write_text('{"prompt": "a", "chosen": "b", "rejected": "b"}\n')
     (tmp_path / "odd.jsonl").write_text('{"prompt": "a", "chosen": "b", "rejected": "c", "p_chosen": 2}\n')
     (tmp_path / "wrong.py").write_text("def score(prompts, completions, ids):\n    return 1.0\n")
+    (tmp_path / "raising.py").write_text("def score(prompts, completions, ids):\n    return [int('a\\nb')]\n")
     cases = [
         ([*ppo, "--reward", "nowhere"], "is no reward"),
         ([*ppo, "--reward", "x*nowhere"], "WEIGHT*WHAT"),
         ([*ppo, "--reward", f"{folder}/rewards.py:width"], "no function width"),
         ([*ppo, "--reward", base], "without a scalar head"),
         ([*ppo, "--reward", f"{tmp_path}/wrong.py:score"], "a number a text"),
+        (
+            [*ppo, "--reward", f"2*{tmp_path}/raising.py:score", "--out", str(tmp_path / "w")],
+            f"the reward {tmp_path}/raising.py:score failed: ValueError: invalid literal for int() with base 10: 'a\\nb' "
+            f"({tmp_path}/raising.py, line 2)",
+        ),
         ([*ppo, "--reward", str(reward), "--max-kl", "-1"], "above 0"),
         ([*ppo, "--reward", str(reward), "--set", "target_kll=3"], "did you mean"),
         (["rloo", *ppo[1:], "--reward", str(reward), "--set", "baseline=group"], "thorndike language grpo"),
@@ -197,6 +253,7 @@ def test_mistakes_are_one_line(folder: Path, reward: Path, capsys: pytest.Captur
         (["dpo", base, "--data", str(tmp_path / "odd.jsonl"), "--out", str(tmp_path / "y")], "odd.jsonl, row 1: p_chosen is 2"),
         (["reward", base, "--data", prompts, "--out", str(tmp_path / "y")], "expected a preference"),
         (["eval", str(reward), "--base", base, "--prompts", prompts, "--reward", str(reward)], "not of the shape"),
+        (["eval", base, "--base", base, "--prompts", prompts, "--reward", str(reward), "--reward", str(reward)], "given twice"),
         (["ask", "--db", str(folder / "p.db"), "--reward", str(reward)], "there is no store"),
         (["eval", base, "--base", base, "--prompts", prompts, "--reward", str(reward), "--temperature", "0"], "above 0"),
         ([*reward_words(folder), "--lora", "2"], "begun with another lora"),

@@ -16,10 +16,11 @@ from thorndike.language import grpo as groups
 from thorndike.language import ppo as proximal
 from thorndike.language.comparisons import comparison_data, preferred
 from thorndike.language.decoder import hidden_states, logits
-from thorndike.language.lora import LoraConfig
+from thorndike.language.lora import Adapter, LoraConfig, merged
 from thorndike.language.model import LanguageModel, load_decoder, never_ending
 from thorndike.language.over_optimisation import Limits, Signals, Watch, repetition, trouble, watched
 from thorndike.language.policy_descent import check_ratio
+from thorndike.language.policy_files import Progress, load_progress, save_progress
 from thorndike.language.policy_training import Task, train_policy
 from thorndike.language.rewards import checked_scores, weighted_sum
 from thorndike.language.rollouts import Prompts, as_written, choose_prompts, distance, distance_metrics, sample_rollout
@@ -211,6 +212,29 @@ def test_it_goes_on_bit_for_bit(tmp_path):
     assert numbers(whole) == numbers(cut)
     jax.tree.map(np.testing.assert_array_equal, straight.params, resumed.params)
     assert json.loads((cut / "outcome.json").read_text())["status"] == "finished"
+
+
+def test_the_adapter_that_is_kept_is_that_of_the_parameters_that_are_kept(tmp_path):
+    config, lora = groups.Config(**(SMALL | {"learning_rate": 0.01}), total_steps=30, group=4, kl_coefficient=0.0), LoraConfig(2, 4.0)
+    learner, task, run = groups.grpo(config, BASE.config, PARAMS, lora), Task(BASE, PROMPTS, by_token), start(tmp_path, "adapted")
+    limits = Limits(0.3, None, None, None)
+    assert not train_policy(task, learner, config, run, limits=limits, until=2).finished
+    outcome = train_policy(task, learner, config, run, limits=limits)
+    assert outcome.stopped is not None and 2 <= outcome.iterations < 30
+    jax.tree.map(np.testing.assert_array_equal, outcome.params, merged(PARAMS, CONFIG, Adapter(lora, outcome.adapter)))
+    again = train_policy(task, learner, config, run, limits=limits)
+    jax.tree.map(np.testing.assert_array_equal, again.adapter, outcome.adapter)
+    assert outcome.kl > 0
+
+
+def test_checkpoints_of_older_versions_have_no_adapter(tmp_path):
+    tree, adapter, progress = {"a": jnp.ones(2)}, {"q": jnp.arange(3.0)}, Progress(4, Watch(), 1.0)
+    for name, saved in {"old": None, "new": adapter}.items():
+        run = start(tmp_path, name)
+        save_progress(run, tree, progress, saved)
+        found = load_progress(run, tree, adapter)
+        assert found[1] == progress and (found[2] is None) == (saved is None)
+    np.testing.assert_array_equal(found[2]["q"], adapter["q"])
 
 
 def test_beyond_the_limit_the_last_parameters_within_it_are_kept(tmp_path):

@@ -15,9 +15,10 @@ from thorndike.language import grpo as groups
 from thorndike.language import ppo as proximal
 from thorndike.language.best_of_n import best, sample_many
 from thorndike.language.comparisons import ComparisonData, comparison_data
+from thorndike.language.data import prompts_tokens
 from thorndike.language.json_fields import Dtype
 from thorndike.language.learner import State
-from thorndike.language.lora import LoraConfig
+from thorndike.language.lora import Adapter, LoraConfig, save_adapter
 from thorndike.language.model import LanguageModel, computing_in, load_model, never_ending, precision, save_model
 from thorndike.language.over_optimisation import Limits
 from thorndike.language.policy_learner import PolicyLearner
@@ -28,9 +29,9 @@ from thorndike.language.reward_model import Config as RewardConfig
 from thorndike.language.reward_model import reward_model
 from thorndike.language.reward_report import HeldOut
 from thorndike.language.reward_training import as_one, passes, report_on, scores_of
-from thorndike.language.rewards import Score, model_score, weighted_sum
+from thorndike.language.rewards import Score, function_score, model_score, weighted_sum
 from thorndike.language.rollouts import Written, make_prompts
-from thorndike.language.text_run import MODEL, TextOutcome, TextPlan, open_run, run_learner
+from thorndike.language.text_run import ADAPTER, MODEL, TextOutcome, TextPlan, open_run, run_learner
 from thorndike.language.win_rate import Comparison, compare_with_base
 from thorndike.settings import settings_of
 from thorndike.training.run_directory import write_json
@@ -63,6 +64,11 @@ def parse_reward(text: str) -> Reward:
         return Reward(float(weight) if star else 1.0, what)
     except ValueError:
         raise UserError(f"a reward is WHAT or WEIGHT*WHAT, such as 0.5*runs/reward/model; got '{text}'") from None
+
+
+def _named(part: Reward) -> str:
+    """What was asked for, in the words of ``parse_reward``."""
+    return part.what if part.weight == 1.0 else f"{part.weight}*{part.what}"
 
 
 def load_rewards(parts: Sequence[Reward], base: LanguageModel) -> Rewards:
@@ -167,6 +173,8 @@ def align(
     )
     write_json(out / "comparison.json", as_json(found))
     if not (out / MODEL).exists():
+        if lora is not None and outcome.adapter is not None:
+            save_adapter(Adapter(lora, outcome.adapter), plain.config, out / ADAPTER, str(folder.absolute()))
         save_model(plain._replace(params=outcome.params), out / MODEL)
     return outcome, found
 
@@ -197,6 +205,8 @@ def align_by_preferences(
     plan = TextPlan(config.total_steps, log_every=max(1, config.total_steps // 100), checkpoint_every=max(1, config.total_steps // 5))
     outcome = run_learner(out, learner, base.params, batch, plan, seed, progress=progress)
     if outcome.status == "finished" and not (out / MODEL).exists():
+        if lora is not None:
+            save_adapter(Adapter(lora, outcome.state.trained), plain.config, out / ADAPTER, str(folder.absolute()))
         save_model(plain._replace(params=learner.params(outcome.state, learner.frozen(base.params))), out / MODEL)
     return outcome
 
@@ -214,8 +224,10 @@ def compare_folders(
     if jax.tree.map(jnp.shape, first.params) != jax.tree.map(jnp.shape, second.params):
         raise UserError(f"{policy} is not of the shape of {base}: their divergence has no meaning; compare a policy with what it began as")
     texts = read_prompts(prompts)
-    width = max(len(tokens) for tokens in first.tokenizer.encode_many(texts))
-    named = {each.what: load_rewards([each], first).score for each in scores}
+    width = max(map(len, prompts_tokens(texts, first.tokenizer)))
+    named = {_named(each): load_rewards([each], first).score for each in scores}
+    if len(named) < len(scores):
+        raise UserError("a --reward is given twice: each is reported on its own, so give it once")
     return compare_with_base(
         first, second.params, make_prompts(texts, first.tokenizer, width), named, max_new_tokens=max_new_tokens, temperature=temperature,
         seed=seed,
@@ -295,4 +307,5 @@ def _function(name: str) -> Score:
     function = getattr(module, attribute, None)
     if not callable(function):
         raise UserError(f"{name}: there is no function {attribute}; it must take prompts, completions and ids, and return a number a text")
-    return cast(Score, function)
+    file = getattr(module, "__file__", None)
+    return function_score(cast(Score, function), name, None if file is None else Path(file))

@@ -113,6 +113,12 @@ def prompt_tokens(prompt: Text, tokenizer: Tokenizer) -> list[int]:
     return tokenizer.encode(prompt) if isinstance(prompt, str) else tokenizer.encode_chat(prompt)
 
 
+def prompts_tokens(prompts: Sequence[Text], tokenizer: Tokenizer) -> list[list[int]]:
+    """The same of many prompts at once."""
+    texts = iter(tokenizer.encode_many([each for each in prompts if isinstance(each, str)]))
+    return [next(texts) if isinstance(each, str) else tokenizer.encode_chat(each) for each in prompts]
+
+
 def completion_tokens(prompt: Text, completion: Text, tokenizer: Tokenizer, where: str) -> list[int]:
     """A completion as the model would have written it after the prompt, the end of text included."""
     if isinstance(prompt, str):

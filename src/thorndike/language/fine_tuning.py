@@ -14,10 +14,8 @@ from thorndike.language.model import LanguageModel, computing_in, load_model, pr
 from thorndike.language.packing import PackedRows, batch_at, packed
 from thorndike.language.pretraining import held_out_loss
 from thorndike.language.sft import Config, TextBatch, sft
-from thorndike.language.text_run import MODEL, TextOutcome, TextPlan, open_run, run_learner
+from thorndike.language.text_run import ADAPTER, MODEL, TextOutcome, TextPlan, open_run, run_learner
 from thorndike.settings import settings_of
-
-ADAPTER = "adapter"
 
 
 def fine_tune(

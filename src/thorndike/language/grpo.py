@@ -166,5 +166,6 @@ def grpo(config: Config, model_config: ModelConfig, reference: Params, lora: Lor
         init=init,
         params=lambda state: trained.params(state.learnt, frozen),
         update=lambda state, rollout, found, score, key: update(state, frozen, rollout, found, score, key),
+        adapter=lambda state: None if lora is None else state.learnt,
         samples=config.group,
     )

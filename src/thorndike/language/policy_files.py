@@ -14,7 +14,7 @@ from thorndike.training.sealed_folders import NewFolder, SealedFolder, discard
 from thorndike.training.tensorboard import EventWriter
 from thorndike.training.tree_files import read_tree, write_tree
 
-_PROGRESS, _STATE, _KEPT = "progress.json", "state", 2
+_PROGRESS, _STATE, _ADAPTER, _KEPT = "progress.json", "state", "adapter", 2
 
 
 class Progress(NamedTuple):
@@ -30,33 +30,38 @@ def set_outcome(run: Path, content: Mapping[str, object]) -> None:
     write_json(run / "outcome.json", content)
 
 
-def save_progress(run: Path, tree: PyTree, progress: Progress) -> None:
-    """A checkpoint; the two newest are kept."""
+def save_progress(run: Path, tree: PyTree, progress: Progress, adapter: PyTree | None = None) -> None:
+    """A checkpoint, with the ``adapter`` of the policy that is kept if there is one; the two newest are kept."""
     folder = run / "checkpoints"
     folder.mkdir(exist_ok=True)
     new = NewFolder(folder / "partial")
     write_tree(tree, new, _STATE)
+    if adapter is not None:
+        write_tree(adapter, new, _ADAPTER)
     new.write(_PROGRESS, as_bytes({"iteration": progress.iteration, "watch": progress.watch._asdict(), "wall_s": progress.wall_s}))
     new.publish(folder / str(progress.iteration))
     for path in checkpoints(run)[:-_KEPT]:
         discard(path)
 
 
-def load_progress(run: Path, like: PyTree) -> tuple[PyTree, Progress]:
-    """The newest intact checkpoint, or where there is none ``like`` itself; later lines of the log are dropped.
+def load_progress(run: Path, like: PyTree, adapter: PyTree | None = None) -> tuple[PyTree, Progress, PyTree | None]:
+    """The newest intact checkpoint, or where there is none ``like`` and ``adapter`` themselves; later lines of the log are dropped.
+
+    The adapter is None where the checkpoint is of a version that kept none.
 
     Raises ``UserError`` if there are some, and all are damaged.
     """
     if not checkpoints(run):
         truncate_lines(run / "metrics.jsonl", 0)
-        return like, Progress(0, Watch(), 0.0)
+        return like, Progress(0, Watch(), 0.0), adapter
 
-    def read(folder: SealedFolder) -> tuple[PyTree, Progress]:
-        return read_tree(like, folder, _STATE), _read_progress(folder)
+    def read(folder: SealedFolder) -> tuple[PyTree, Progress, PyTree | None]:
+        kept = None if adapter is None or f"{_ADAPTER}.safetensors" not in folder else read_tree(adapter, folder, _ADAPTER)
+        return read_tree(like, folder, _STATE), _read_progress(folder), kept
 
-    tree, progress = newest(run, read)
+    tree, progress, kept = newest(run, read)
     truncate_lines(run / "metrics.jsonl", progress.iteration)
-    return tree, progress
+    return tree, progress, kept
 
 
 class Log:

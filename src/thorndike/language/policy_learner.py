@@ -6,6 +6,7 @@ from typing import NamedTuple
 from jaxtyping import Array, Float, Key, PyTree
 
 from thorndike.language.decoder import Params
+from thorndike.language.lora import LowRank
 from thorndike.language.rollouts import Distance, Rollout
 from thorndike.types import Metrics
 
@@ -19,5 +20,7 @@ class PolicyLearner(NamedTuple):
     """State -> the policy's parameters, an adapter merged into them."""
     update: Callable[[PyTree, Rollout, Distance, Float[Array, " B"], Key[Array, ""]], tuple[PyTree, Metrics]]
     """State (which is used up), texts, their distance to the reference, their scores, key -> State, metrics. One compiled program."""
+    adapter: Callable[[PyTree], LowRank | None]
+    """State -> the adapter that is learnt; None where all parameters are."""
     samples: int
     """Completions of each prompt, side by side in a rollout."""

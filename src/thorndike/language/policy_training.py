@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float, Key, PyTree
 
 from thorndike.language.decoder import Params
+from thorndike.language.lora import LowRank
 from thorndike.language.model import LanguageModel, stop_tokens
 from thorndike.language.over_optimisation import Limits, Signals, mean_disagreement, mean_repetition, trouble, watched
 from thorndike.language.policy_descent import check_ratio
@@ -101,6 +102,16 @@ class Outcome(NamedTuple):
     """Which limit ended the run, in words; None if none did."""
     finished: bool
     """False where it was interrupted, or paused: called again, it goes on."""
+    adapter: LowRank | None
+    """That makes these parameters of the base; None where all are learnt, or the run was begun by a version that kept none."""
+
+
+class Kept(NamedTuple):
+    """The last policy that kept all limits."""
+
+    params: Params
+    kl: Float[Array, ""]
+    adapter: LowRank | None
 
 
 class Iteration(NamedTuple):
@@ -123,8 +134,14 @@ def train_policy(
     """
     key, began = jax.random.key(seed), time.perf_counter()
     state = learner.init(jax.random.fold_in(key, 2**31 - 1))
-    (state, kept, kept_kl), progress = load_progress(run, (state, _copied(learner.params(state)), jnp.float32(0.0)))
+    kept = _kept(learner, state, 0.0)
+    (state, params, kl), progress, adapter = load_progress(run, (state, kept.params, kept.kl), kept.adapter)
+    kept = Kept(params, kl, adapter)
     iteration, watch, stopped = progress.iteration, progress.watch, None
+
+    def save() -> None:
+        save_progress(run, (state, kept.params, kept.kl), Progress(iteration, watch, _since(progress, began)), kept.adapter)
+
     with ExitStack() as stack:
         stack.enter_context(run_lock(run))
         log = Log(run)
@@ -132,15 +149,15 @@ def train_policy(
         interrupted = stack.enter_context(stop_requests())
         while iteration < config.total_steps:
             if iteration == until or interrupted() is not None:
-                save_progress(run, (state, kept, kept_kl), Progress(iteration, watch, _since(progress, began)))
-                return Outcome(kept, iteration, float(kept_kl), None, False)
+                save()
+                return Outcome(kept.params, iteration, float(kept.kl), None, False, kept.adapter)
             key_write, key_learn = jax.random.split(jax.random.fold_in(key, iteration))
             found = write(task, learner.params(state), config, learner.samples, key_write)
             watch = watched(watch, found.signals)
             stopped = trouble(limits, watch, found.signals)
             if stopped is not None:
                 break
-            kept, kept_kl = _copied(learner.params(state)), jnp.float32(found.signals.kl)
+            kept = _kept(learner, state, found.signals.kl)
             state, metrics = learner.update(state, found.rollout, found.distance, found.score, key_learn)
             check_ratio(metrics, task.base.config.dtype)
             iteration += 1
@@ -149,18 +166,18 @@ def train_policy(
             if told is not None:
                 told(iteration, values)
             if iteration % checkpoint_every == 0:
-                save_progress(run, (state, kept, kept_kl), Progress(iteration, watch, _since(progress, began)))
+                save()
         if stopped is None:
             # What the last step made has been seen by nobody yet.
             found = write(task, learner.params(state), config, learner.samples, jax.random.fold_in(key, iteration))
             stopped = trouble(limits, watched(watch, found.signals), found.signals)
             if stopped is None:
-                kept, kept_kl = _copied(learner.params(state)), jnp.float32(found.signals.kl)
-        save_progress(run, (state, kept, kept_kl), Progress(iteration, watch, _since(progress, began)))
+                kept = _kept(learner, state, found.signals.kl)
+        save()
     set_outcome(
-        run, {"status": "finished" if stopped is None else "stopped", "iterations": iteration, "kl": float(kept_kl), "why": stopped}
+        run, {"status": "finished" if stopped is None else "stopped", "iterations": iteration, "kl": float(kept.kl), "why": stopped}
     )
-    return Outcome(kept, iteration, float(kept_kl), stopped, True)
+    return Outcome(kept.params, iteration, float(kept.kl), stopped, True, kept.adapter)
 
 
 def write(task: Task, params: Params, config: LoopConfig, samples: int, key: Key[Array, ""]) -> Iteration:
@@ -198,9 +215,10 @@ def write(task: Task, params: Params, config: LoopConfig, samples: int, key: Key
     return Iteration(rollout, found, jnp.asarray(score, jnp.float32), signals, metrics)
 
 
-def _copied(params: Params) -> PyTree:
-    """The learner's own arrays are used up by its next step."""
-    return jax.tree.map(jnp.copy, params)
+def _kept(learner: PolicyLearner, state: PyTree, kl: float) -> Kept:
+    """Copies, because the learner's own arrays are used up by its next step."""
+    params, adapter = jax.tree.map(jnp.copy, (learner.params(state), learner.adapter(state)))
+    return Kept(params, jnp.float32(kl), adapter)
 
 
 def _since(progress: Progress, began: float) -> float:

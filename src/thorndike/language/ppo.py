@@ -195,6 +195,7 @@ def ppo(
         init=init,
         params=lambda state: trained.params(state.learnt["policy"], frozen),
         update=lambda state, rollout, found, score, key: update(state, frozen, rollout, found, score, key),
+        adapter=lambda state: None if lora is None else state.learnt["policy"],
         samples=1,
     )
 

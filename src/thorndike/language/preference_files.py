@@ -5,7 +5,7 @@ from pathlib import Path
 
 from thorndike.errors import UserError
 from thorndike.language.comparisons import Comparison, Pair
-from thorndike.language.data import Row, completion_tokens, format_of, prompt_tokens, read_rows, text_at
+from thorndike.language.data import Row, Text, completion_tokens, format_of, prompt_tokens, read_rows, text_at
 from thorndike.language.preferences.records import with_explicit_prompt
 from thorndike.language.tokenizer import Tokenizer
 from thorndike.training.json_files import quoted
@@ -31,16 +31,9 @@ def read_comparisons(paths: Iterable[Path], tokenizer: Tokenizer) -> list[Compar
     return [Comparison(tuple(texts), len(group[1]), tuple(pairs[group])) for group, texts in groups.items()]
 
 
-def read_prompts(paths: Iterable[Path]) -> list[str]:
-    """The texts of a column ``prompt``. Raises ``UserError`` for conversations, which have no one text."""
-    found = []
-    for path in paths:
-        for row in read_rows(path):
-            prompt = text_at(row, "prompt")
-            if not isinstance(prompt, str):
-                raise UserError(f"{row.where}: prompt is a conversation; apply the chat template, and give the text")
-            found.append(prompt)
-    return found
+def read_prompts(paths: Iterable[Path]) -> list[Text]:
+    """The texts and conversations of a column ``prompt``. Raises ``UserError`` for what is neither, naming file and row."""
+    return [text_at(row, "prompt") for path in paths for row in read_rows(path)]
 
 
 def _texts(row: Row, tokenizer: Tokenizer) -> tuple[tuple[int, ...], Sequence[int], Sequence[int]]:

@@ -1,6 +1,7 @@
 """What a text is worth: reward models, Python functions and verifiers behind one signature, alone or summed with weights."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -9,6 +10,7 @@ from jaxtyping import Float
 from thorndike.errors import UserError
 from thorndike.language.reward_files import RewardModel
 from thorndike.training.json_files import quoted
+from thorndike.user_code import one_line, place_in
 
 
 class Score(Protocol):
@@ -36,6 +38,20 @@ def model_score(model: RewardModel, clip: float | None = None) -> Score:
     def score(prompts: Sequence[str], completions: Sequence[str], ids: Sequence[Sequence[int]]) -> Float[np.ndarray, " B"]:
         found = model.score(prompts, completions, ids)
         return found if clip is None else np.clip(found, -clip, clip)
+
+    return score
+
+
+def function_score(function: Score, name: str, file: Path | None) -> Score:
+    """A user's function, by the ``name`` that was given; whatever it raises is one line that says where in ``file``, the user's."""
+
+    def score(
+        prompts: Sequence[str], completions: Sequence[str], ids: Sequence[Sequence[int]]
+    ) -> Float[np.ndarray, " B"] | Sequence[float]:
+        try:
+            return function(prompts, completions, ids)
+        except Exception as error:
+            raise UserError(f"the reward {name} failed: {type(error).__name__}: {one_line(error)}{place_in(file, error)}") from error
 
     return score
 

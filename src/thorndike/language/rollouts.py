@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from thorndike.errors import UserError
 from thorndike.functional.policy_divergence import categorical_divergence
 from thorndike.functional.token_rewards import kl_estimate
+from thorndike.language.data import Text, prompts_tokens
 from thorndike.language.decoder import Params, by_vocabulary, hidden_states, logits, token_log_probs
 from thorndike.language.generation import Generated, Sampling, generate, left_padded
 from thorndike.language.model_config import ModelConfig
@@ -58,14 +59,18 @@ class Distance(NamedTuple):
     """KL(policy || reference) over the whole vocabulary in that state: never negative, whatever was sampled."""
 
 
-def make_prompts(texts: Sequence[str], tokenizer: Tokenizer, width: int) -> Prompts:
-    """Prompts in tokens. Raises ``UserError`` for one that is empty or longer than ``width``."""
-    encoded = tokenizer.encode_many(texts)
+def make_prompts(prompts: Sequence[Text], tokenizer: Tokenizer, width: int) -> Prompts:
+    """Prompts in tokens; the text of a conversation is what the chat template makes of it.
+
+    Raises ``UserError`` for one that is empty or longer than ``width``.
+    """
+    encoded = prompts_tokens(prompts, tokenizer)
+    texts = tuple(each if isinstance(each, str) else tokenizer.chat(each) for each in prompts)
     for number, each in enumerate(encoded, 1):
         if not 0 < len(each) <= width:
             raise UserError(f"prompt {number} has {len(each)} tokens; expected 1 to {width}: leave it out, or raise max_prompt_length")
     tokens, segments = left_padded(encoded, tokenizer.pad_id, width)
-    return Prompts(np.asarray(tokens), np.asarray(segments), tuple(texts))
+    return Prompts(np.asarray(tokens), np.asarray(segments), texts)
 
 
 def choose_prompts(prompts: Prompts, key: Key[Array, ""], number: int) -> Int[np.ndarray, " number"]:

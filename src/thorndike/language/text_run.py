@@ -30,7 +30,7 @@ from thorndike.training.tensorboard import EventWriter
 from thorndike.training.tree_files import read_tree, write_tree
 from thorndike.types import Metrics
 
-METRICS, MODEL = "metrics.jsonl", "model"
+METRICS, MODEL, ADAPTER = "metrics.jsonl", "model", "adapter"
 _STATE, _PROGRESS = "state", "progress.json"
 _KEPT = 2
 

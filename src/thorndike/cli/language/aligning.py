@@ -16,6 +16,7 @@ from thorndike.cli.language.arguments import (
     sharing,
 )
 from thorndike.cli.language.config_file import parse_with_config
+from thorndike.cli.language.hub import model_folder
 from thorndike.cli.parser import Parser, positive_whole, seed_number
 from thorndike.errors import UserError
 
@@ -33,7 +34,7 @@ a text. Settings:
 
 def add_training_arguments(parser: Parser) -> None:
     """Model, folder, adapter, settings, seed, device."""
-    parser.add_argument("model", metavar="MODEL", type=Path, help="a folder as transformers' save_pretrained writes it")
+    parser.add_argument("model", metavar="MODEL", type=Path, help="a folder as save_pretrained writes it, or owner/name on the hub")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="the run's folder; its model/ is a Hugging Face folder")
     parser.add_argument("--lora", type=positive_whole, metavar="RANK", help="learn an adapter of this rank instead of all parameters")
     add_settings_argument(parser)
@@ -69,6 +70,7 @@ def run_policy_verb(verb: str, summary: str, words: Sequence[str]) -> Answer:
     settings = given_settings(options.settings, module)
     if verb == "rloo" and "baseline" in settings:
         raise UserError("rloo is GRPO with baseline=leave_one_out; to choose another baseline: thorndike language grpo")
+    options.model = model_folder(options.model)
     prepare_device(options.device, options.model, options.devices)
     from thorndike.language.aligning import align, parse_reward
     from thorndike.language.over_optimisation import Limits

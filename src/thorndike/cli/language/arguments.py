@@ -21,7 +21,7 @@ _LARGE = 64 * 2**20
 
 def add_model_argument(parser: Parser) -> None:
     """The model's folder, and the device."""
-    parser.add_argument("model", metavar="MODEL", type=Path, help="a folder as transformers' save_pretrained writes it")
+    parser.add_argument("model", metavar="MODEL", type=Path, help="a folder as save_pretrained writes it, or owner/name on the hub")
     parser.add_argument("--adapter", metavar="DIR", type=Path, help="a LoRA adapter in PEFT's format, merged into the model")
     add_device_argument(parser)
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from thorndike.cli.answer import Answer
 from thorndike.cli.language.arguments import add_model_argument, add_sampling_arguments, prepare_device
 from thorndike.cli.language.config_file import parse_with_config
+from thorndike.cli.language.hub import model_folder
 from thorndike.cli.parser import Parser, seed_number
 
 EXAMPLES = """\
@@ -22,6 +23,7 @@ def run(words: Sequence[str]) -> Answer:
     parser.add_argument("--system", metavar="TEXT", help="what the model is told before the conversation")
     parser.add_argument("--seed", type=seed_number, default=0, help="the number that all answers follow from (default: 0)")
     options = parse_with_config(parser, words, "chat", None)
+    options.model = model_folder(options.model)
     prepare_device(options.device, options.model)
     from thorndike.language.generation import Sampling, stream_text
     from thorndike.language.model import load_model

@@ -7,6 +7,7 @@ from thorndike.cli.answer import Answer
 from thorndike.cli.language.aligning import add_training_arguments, lora_of
 from thorndike.cli.language.arguments import given_settings, prepare_device, settings_in_words, sharing
 from thorndike.cli.language.config_file import parse_with_config
+from thorndike.cli.language.hub import model_folder
 from thorndike.cli.language.report import report
 from thorndike.cli.parser import Parser
 
@@ -24,6 +25,7 @@ def run(words: Sequence[str]) -> Answer:
     parser.add_argument("--data", type=Path, action="append", required=True, metavar="FILE", help="rows with chosen and rejected")
     options = parse_with_config(parser, words, "dpo", "dpo")
     settings = given_settings(options.settings, "dpo")
+    options.model = model_folder(options.model)
     prepare_device(options.device, options.model, options.devices)
     from thorndike.language.aligning import align_by_preferences
 

@@ -7,6 +7,7 @@ from thorndike.cli.answer import Answer
 from thorndike.cli.language.aligning import above_zero, comparison_data, in_words
 from thorndike.cli.language.arguments import add_device_argument, add_ignore_eos_argument, prepare_device
 from thorndike.cli.language.config_file import parse_with_config
+from thorndike.cli.language.hub import model_folder
 from thorndike.cli.parser import Parser, positive_whole, seed_number
 
 EXAMPLES = """\
@@ -27,6 +28,7 @@ def run(words: Sequence[str]) -> Answer:
     parser.add_argument("--seed", type=seed_number, default=0, help="the number that all texts follow from (default: 0)")
     add_device_argument(parser)
     options = parse_with_config(parser, words, "eval", None)
+    options.policy, options.base = model_folder(options.policy), model_folder(options.base)
     prepare_device(options.device, options.policy)
     from thorndike.language.aligning import compare_folders, parse_reward
 

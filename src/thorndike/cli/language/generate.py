@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, cast
 from thorndike.cli.answer import Answer, printable
 from thorndike.cli.language.arguments import add_ignore_eos_argument, add_model_argument, add_sampling_arguments, prepare_device
 from thorndike.cli.language.config_file import parse_with_config
+from thorndike.cli.language.hub import model_folder
 from thorndike.cli.parser import Parser, positive_whole, seed_number
 from thorndike.errors import UserError
 
@@ -42,6 +43,7 @@ def run(words: Sequence[str]) -> Answer:
         raise UserError(f"--to {options.to} is there already: nothing is written over; choose another file")
     if options.reward and (options.top_k, options.top_p, options.adapter) != (0, 1.0, None):
         raise UserError("--reward chooses among samples of the model's own distribution: leave --top-k, --top-p and --adapter out")
+    options.model = model_folder(options.model)
     prepare_device(options.device, options.model)
     from thorndike.language.data import read_rows, text_at
 

@@ -7,6 +7,7 @@ from thorndike.cli.answer import Answer
 from thorndike.cli.language.aligning import add_training_arguments, lora_of
 from thorndike.cli.language.arguments import given_settings, prepare_device, settings_in_words, sharing
 from thorndike.cli.language.config_file import parse_with_config
+from thorndike.cli.language.hub import model_folder
 from thorndike.cli.parser import Parser, positive_whole
 
 EXAMPLES = """\
@@ -28,6 +29,7 @@ def run(words: Sequence[str]) -> Answer:
     parser.add_argument("--members", type=positive_whole, default=1, metavar="N", help="models whose mean is the reward (default: 1)")
     options = parse_with_config(parser, words, "reward", "reward_model")
     settings = given_settings(options.settings, "reward_model")
+    options.model = model_folder(options.model)
     prepare_device(options.device, options.model, options.devices)
     from thorndike.language.aligning import train_reward_model
 

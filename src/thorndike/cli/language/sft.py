@@ -15,6 +15,7 @@ from thorndike.cli.language.arguments import (
     sharing,
 )
 from thorndike.cli.language.config_file import parse_with_config
+from thorndike.cli.language.hub import model_folder
 from thorndike.cli.language.report import report
 from thorndike.cli.parser import Parser, positive_whole, seed_number
 
@@ -28,7 +29,7 @@ The same command again goes on where it stopped. Settings:
 def run(words: Sequence[str]) -> Answer:
     """Learn from rows, and say how well."""
     parser = Parser("language sft", "Fine-tune a model on TRL's formats.", EXAMPLES.format(settings=settings_in_words("sft")))
-    parser.add_argument("model", metavar="MODEL", type=Path, help="a folder as transformers' save_pretrained writes it")
+    parser.add_argument("model", metavar="MODEL", type=Path, help="a folder as save_pretrained writes it, or owner/name on the hub")
     parser.add_argument("--data", type=Path, action="append", required=True, metavar="FILE", help="rows to learn from; may be repeated")
     parser.add_argument("--held-out", type=Path, action="append", default=[], metavar="FILE", help="rows to measure with")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="the run's folder; its model/ is a Hugging Face folder")
@@ -41,6 +42,7 @@ def run(words: Sequence[str]) -> Answer:
     add_device_argument(parser)
     options = parse_with_config(parser, words, "sft", "sft")
     settings = given_settings(options.settings, "sft")
+    options.model = model_folder(options.model)
     prepare_device(options.device, options.model, options.devices)
     from thorndike.language.fine_tuning import fine_tune
     from thorndike.language.lora import LoraConfig
