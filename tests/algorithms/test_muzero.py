@@ -110,7 +110,9 @@ def test_what_it_cannot_learn_is_refused():
         build_algorithm("muzero", {"buffer_size": 10, "train_freq": 2}, spec, None)
 
 
-@pytest.mark.parametrize(("environment", "engine"), [("tic_tac_toe", "auto"), ("CartPole-v1", "gymnasium")])
+@pytest.mark.parametrize(
+    ("environment", "engine"), [pytest.param("tic_tac_toe", "auto", marks=pytest.mark.slow), ("CartPole-v1", "gymnasium")]
+)
 def test_a_run_is_saved_loaded_and_gone_on_with(environment: str, engine: str, tmp_path: Path, quick_compile: None):
     result = td.train("muzero", environment, steps=256, num_envs=8, engine=engine, settings=SMALL, preset="none", output=tmp_path)
     policy = td.load(result.run)

@@ -74,9 +74,9 @@ def test_numbers_are_counted_by_the_cell_they_fall_in():
 
 
 def test_hashed_counts_rarely_meet():
-    obs = np.random.default_rng(0).integers(0, 10, (2000, 1, 7, 7, 3)).astype(np.uint8)
+    obs = np.random.default_rng(0).integers(0, 10, (500, 1, 7, 7, 3)).astype(np.uint8)
     space = spaces.Dict({"image": spaces.Box(0, 255, (7, 7, 3), np.uint8), "action_mask": spaces.MultiBinary(2)})
-    shown = {"image": obs, "action_mask": np.ones((2000, 1, 2), np.int8)}
+    shown = {"image": obs, "action_mask": np.ones((500, 1, 2), np.int8)}
     statistics, (reward,) = taught(count_bonus(1.0), space, rollout_of(shown, reward=0.0), num_envs=1)
     assert statistics.shape == (2**20,)
     assert (reward == 1.0).mean() > 0.99

@@ -40,7 +40,7 @@ class NativeHost:
     """A native environment stepped from Python as a host engine is."""
 
     def __init__(self, environment: Environment) -> None:
-        self.spec = environment.spec._replace(can_vmap=False, can_restore=False, engine="gymnasium")
+        self.spec = environment.spec._replace(engine="gymnasium")
         self._environment, self._step = environment, jax.jit(environment.step)
         self._noise = jax.tree.map(lambda leaf: leaf[0], environment.draw(jax.random.key(0), 1))
 

@@ -61,7 +61,9 @@ CASES = {
 
 
 @pytest.mark.usefixtures("quick_compile")
-@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow if name in ("impala", "trpo") else ()) for name in CASES])
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if name in ("a2c", "impala", "trpo", "reinforce") else ()) for name in CASES]
+)
 def test_a_lane_learns_what_an_agent_of_its_settings_learns(name):
     id, fixed, own, iterations = CASES[name]
     where, fixed = environment(id), {**fixed, "total_steps": 1_000}
