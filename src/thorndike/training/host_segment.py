@@ -41,9 +41,18 @@ def _alone(algorithm: Algorithm, learn: Callable) -> _Learners:
     """One seed: its axis is taken off inside the program, so that not even a moment's copy is made of a replay of gigabytes."""
 
     def one(*arguments: PyTree) -> PyTree:
-        return jax.tree.map(lambda x: x[None], learn(*jax.tree.map(lambda x: x.reshape(x.shape[1:]), arguments)))
+        return _one_of_one(learn(*_the_one(arguments)))
 
     return _stacked(algorithm, learn)._replace(learn=jax.jit(one, donate_argnums=0))
+
+
+def _the_one(tree: PyTree) -> PyTree:
+    """The only seed of arrays ``[1, ...]``. By another shape, not by an index, which would copy."""
+    return jax.tree.map(lambda x: x.reshape(x.shape[1:]), tree)
+
+
+def _one_of_one(tree: PyTree) -> PyTree:
+    return jax.tree.map(lambda x: x[None], tree)
 
 
 def learning_of_one(learn: Callable) -> Callable:
@@ -60,8 +69,7 @@ def _apart(algorithm: Algorithm, learn: Callable) -> _Learners:
     stack = jax.jit(lambda trees: jax.tree.map(lambda *rows: jnp.stack(rows), *trees))
 
     # Of one seed the same memory in another shape: a copy of its replay at each log point costs TD3 15 % of its time.
-    only = jax.jit(lambda learner: jax.tree.map(lambda x: x.reshape(x.shape[1:]), learner), donate_argnums=0)
-    again = jax.jit(lambda learner: jax.tree.map(lambda x: x[None], learner), donate_argnums=0)
+    only, again = jax.jit(_the_one, donate_argnums=0), jax.jit(_one_of_one, donate_argnums=0)
 
     def take(learner: PyTree) -> PyTree:
         seeds = jax.tree.leaves(learner)[0].shape[0]

@@ -1,12 +1,9 @@
 """``thorndike language VERB ...``: language models; finds the verb's file and runs it."""
 
-import importlib
 from collections.abc import Sequence
 
 from thorndike.cli.answer import Answer
-from thorndike.cli.parser import Parser
-from thorndike.errors import UserError
-from thorndike.suggestions import did_you_mean
+from thorndike.cli.verbs import chosen_verb, run_verb
 
 LANGUAGE_VERBS = {
     "generate": "go on with prompts, several samples each",
@@ -40,15 +37,4 @@ EXAMPLES = """\
 
 def run(words: Sequence[str]) -> Answer:
     """Run a verb of language models."""
-    listed = "; ".join(f"{verb}: {summary}" for verb, summary in LANGUAGE_VERBS.items())
-    verb = next((word for word in words if not word.startswith("-")), None)
-    if verb is None:
-        parser = Parser("language", f"Language models as Hugging Face folders. {listed}.", EXAMPLES)
-        parser.add_argument("verb", metavar="VERB", help=f"one of {', '.join(LANGUAGE_VERBS)}")
-        parser.parse(words)
-    if verb not in LANGUAGE_VERBS:
-        raise UserError(f"there is no verb 'language {verb}'{did_you_mean(str(verb), LANGUAGE_VERBS)}; see: thorndike language --help")
-    rest = list(words)
-    rest.remove(str(verb))
-    answer: Answer = importlib.import_module(f"thorndike.cli.language.{verb}").run(rest)
-    return answer
+    return run_verb("language", chosen_verb("language", "Language models as Hugging Face folders.", LANGUAGE_VERBS, EXAMPLES, words), words)
