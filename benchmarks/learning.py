@@ -37,6 +37,9 @@ BARS = (
     Bar("ppo", "CartPole-v1", "iqm", 495, worst=475),
     Bar("ppo", "Pendulum-v1", "mean", -185),
     Bar("ppo", "LunarLander-v3", "mean", 235),
+    Bar("ppo", "MinAtar/Asterix-v0", "iqm", 15, episodes=30),
+    Bar("ppo", "MinAtar/SpaceInvaders-v0", "iqm", 131, episodes=30),
+    Bar("ppo", "MinAtar/Freeway-v0", "iqm", 58, episodes=30),
     Bar("a2c", "CartPole-v1", "iqm", 490),
     Bar("a3c", "CartPole-v1", "iqm", 490),
     Bar("impala", "CartPole-v1", "iqm", 490),
@@ -111,7 +114,7 @@ def write(content: dict) -> Path:
     """Write one bar's result."""
     RESULTS.mkdir(parents=True, exist_ok=True)
     bar = content["bar"]
-    path = RESULTS / f"{bar['algorithm']}-{bar['environment']}.json"
+    path = RESULTS / f"{bar['algorithm']}-{bar['environment'].replace('/', '-')}.json"
     path.write_text(json.dumps(content, indent=1) + "\n")
     return path
 
