@@ -38,6 +38,7 @@ BARS = (
     Bar("ppo", "Pendulum-v1", "mean", -185),
     Bar("ppo", "LunarLander-v3", "mean", 235),
     Bar("ppo", "MinAtar/Asterix-v0", "iqm", 15, episodes=30),
+    Bar("ppo", "MinAtar/Breakout-v0", "iqm", 28, episodes=30),
     Bar("ppo", "MinAtar/SpaceInvaders-v0", "iqm", 131, episodes=30),
     Bar("ppo", "MinAtar/Freeway-v0", "iqm", 58, episodes=30),
     Bar("a2c", "CartPole-v1", "iqm", 490),
