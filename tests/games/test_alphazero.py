@@ -1,5 +1,6 @@
 """AlphaZero: its losses, what it refuses, and tic-tac-toe learnt from nothing until no line is lost."""
 
+import json
 from pathlib import Path
 
 import jax
@@ -67,11 +68,15 @@ def test_what_is_no_game_of_two_is_refused():
 
 
 def test_a_run_is_saved_loaded_and_gone_on_with(tmp_path: Path, quick_compile: None):
+    """With the heads that no search asks: they are exported beside the others."""
     small = {"n_steps": 2, "batch_size": 32, "gradient_steps": 1, "learning_starts": 64, "num_simulations": 4, "width": 8, "blocks": 0}
-    result = td.train("alphazero", "tic_tac_toe", steps=256, num_envs=16, settings=small, preset="none", output=tmp_path)
+    small |= {"ownership_coef": 1.0, "score_coef": 0.1}
+    game = f"{Path(__file__).parents[1] / 'squares_game.py'}:SQUARES"
+    result = td.train("alphazero", game, steps=256, num_envs=16, settings=small, preset="none", output=tmp_path)
     evaluation = td.load(result.run).evaluate(episodes=10)
     assert -1 <= evaluation.mean <= 1 and len(evaluation.rows) == 10
     assert td.resume(result.run, steps=320).steps == 320
+    assert {"train/ownership_loss", "train/score_loss"} <= set(json.loads((result.run / "metrics.jsonl").read_text().splitlines()[-1]))
     policy = td.load(result.run)
     obs = jax.tree.map(np.asarray, observed_position(TIC_TAC_TOE, TIC_TAC_TOE.init(jax.random.key(0))))
     action, _ = policy.predict(obs)

@@ -20,7 +20,9 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from thorndike.errors import UserError
 from thorndike.games.game import Game, Position
 from thorndike.games.tree_loop import Simulations
+from thorndike.networks.board import win_value
 from thorndike.networks.masking import FORBIDDEN
+from thorndike.networks.network import Network
 
 SEARCHES = ("gumbel", "puct")
 
@@ -187,6 +189,17 @@ def _completed(settings: SearchSettings) -> Callable[[mctx.Tree, Int[Array, ""]]
         return mctx.qtransform_completed_by_mix_value(tree, node, value_scale=settings.value_scale, rescale_values=settings.rescale_values)
 
     return transform
+
+
+def by_network(game: Game, network: Network) -> Evaluate:
+    """The evaluation of a network of boards."""
+
+    def evaluate(params: PyTree, positions: Position, key: Key[Array, ""]) -> tuple[Float[Array, "B actions"], Float[Array, " B"]]:
+        del key
+        logits, win, *_ = network.apply(params, jax.vmap(game.observe)(positions))
+        return logits, win_value(win)
+
+    return evaluate
 
 
 def by_playouts(game: Game) -> Evaluate:
