@@ -136,6 +136,8 @@ ALPHAZERO = alphazero.Config(
     blocks=1,
     learning_rate="linear(1e-3, 0)",
 )
+HEADS = {"ownership_coef": 1.0, "score_coef": 0.1}
+GATED = {"gate_every": 3, "gate_games": 4, "gate_threshold": 0.5}
 MUZERO = muzero.Config(
     total_steps=1000,
     buffer_size=120,
@@ -175,7 +177,7 @@ RUN = {
     "bootstrapped_dqn": Case(bootstrapped_dqn.bootstrapped_dqn, bootstrapped_dqn.Config(**OF_THE_FAMILY, n_members=3), "CartPole-v1"),
     "ppo, bonuses": Case(ppo.ppo, PPO, "CartPole-v1", NEW),
     "q_learning": Case(q_learning.q_learning, parts(TABLE, variant="sarsa"), "MountainCar-v0", BINS),
-    "alphazero": GameCase(alphazero.alphazero, parts(ALPHAZERO, resign_threshold=-0.1, ownership_coef=1.0, score_coef=0.1), SQUARES),
+    "alphazero": GameCase(alphazero.alphazero, parts(ALPHAZERO, resign_threshold=-0.1, **HEADS, **GATED), SQUARES),
     "muzero": Case(muzero.muzero, MUZERO, "CartPole-v1"),
     "iql": DataCase(iql.iql, iql.Config(**DATA, learning_rate="linear(1e-3, 0)"), DISCRETE),
     "td3_bc": DataCase(td3_bc.td3_bc, td3_bc.Config(**DATA), BOX),

@@ -80,6 +80,11 @@ class Game(NamedTuple):
     has_chance: bool = False
     """Whether dice are thrown, so that a search needs chance nodes."""
 
+    @property
+    def can_be_searched(self) -> bool:
+        """Whether it is a game of two without dice, which is what a search looks ahead in."""
+        return self.num_players == 2 and not self.has_chance
+
 
 class Choice(NamedTuple):
     """A player's answer to a position."""

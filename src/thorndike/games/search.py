@@ -8,7 +8,7 @@ A value is always that of the player to move, so it changes its sign from one no
 twice). Below a finished position nothing counts (``discount`` 0), and nothing begins anew there.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import NamedTuple, TypeAlias
 
@@ -52,6 +52,13 @@ class SearchSettings(NamedTuple):
     """Stretch the values of a node's moves to [0, 1] first: where nobody knows how large values are."""
 
 
+def settings_from(config: Mapping[str, object], simulations: int) -> SearchSettings:
+    """Of a learner's settings those of its search, by the same names; ``search`` is the kind."""
+    values = SearchSettings()._asdict()
+    values |= {name: config[name] for name in values if name in config}
+    return SearchSettings(**values | {"kind": config.get("search", values["kind"]), "simulations": simulations})
+
+
 class Found(NamedTuple):
     """What a search of positions ``[B]`` found."""
 
@@ -79,7 +86,7 @@ def search(
 
     Raises ``UserError`` for games of one player, and games with dice.
     """
-    if game.num_players != 2 or game.has_chance:
+    if not game.can_be_searched:
         raise UserError(f"the search is for two players without dice, which {game.id} is not")
     key_root, key_search = jax.random.split(key)
     logits, value = evaluate(params, positions, key_root)
