@@ -4,7 +4,9 @@ On a CPU dense layers give some ten times the positions a second of a convolutio
 looks at every square block of the board with the same weights, as a convolution does, which a line of pieces looks alike in everywhere.
 """
 
+import math
 from collections.abc import Callable
+from typing import NamedTuple, TypeAlias
 
 import flax.linen as nn
 import jax
@@ -17,28 +19,55 @@ from thorndike.networks.hidden_layers import SHOWN, hidden_layers
 from thorndike.networks.network import Network
 
 TOWERS = ("mlp", "patches", "conv")
+OWNERSHIP, SCORE = "ownership", "score"
+"""The heads that a network may have beside policy and value."""
 
 _hidden_init = nn.initializers.he_normal()
 _small_init = nn.initializers.variance_scaling(0.01, "fan_in", "normal")
 
 
+class BoardHeads(NamedTuple):
+    """What a network may say of how a game will end, for the player to move. None where it has no such head."""
+
+    ownership: Float[Array, "B H W"] | None
+    """The logit of each square to be the mover's, nobody's counted as half."""
+    score: Float[Array, " B"] | None
+    """How many squares more, divided by the square root of their number."""
+
+
+Said: TypeAlias = tuple[Float[Array, "B actions"], Float[Array, " B"]] | tuple[Float[Array, "B actions"], Float[Array, " B"], BoardHeads]
+
+
 class BoardNetwork(nn.Module):
-    """Logits of the moves and the logit of winning, from a board ``[B, H, W, C]``."""
+    """Logits of the moves and the logit of winning, from a board ``[B, H, W, C]``; with ``heads`` of these names, what they say too."""
 
     actions: int
     tower: str
     width: int
     """Units of a dense layer, channels of a convolution."""
     blocks: int
+    heads: tuple[str, ...] = ()
     patch_size: int = 4
     patch_channels: int = 64
 
     @nn.compact
-    def __call__(self, board: Float[Array, "B H W C"]) -> tuple[Float[Array, "B actions"], Float[Array, " B"]]:
+    def __call__(self, board: Float[Array, "B H W C"]) -> Said:
         """Board to a policy and a value."""
-        x = self._convolutions(board) if self.tower == "conv" else self._dense_layers(board)
+        x = squares = self._convolutions(board) if self.tower == "conv" else self._dense_layers(board)
+        if self.tower == "conv":
+            x = self._shown(dense(self.width, _hidden_init, name="last")(squares.reshape((board.shape[0], -1))))
         value = self._shown(dense(64, _hidden_init, name="value_hidden")(x))
-        return dense(self.actions, _small_init, name="policy")(x), dense(1, _small_init, name="value")(value)[..., 0]
+        said = dense(self.actions, _small_init, name="policy")(x), dense(1, _small_init, name="value")(value)[..., 0]
+        if not self.heads:
+            return said
+        score = dense(1, _small_init, name="score")(value)[..., 0] if SCORE in self.heads else None
+        return *said, BoardHeads(self._ownership(squares, board.shape[:3]) if OWNERSHIP in self.heads else None, score)
+
+    def _ownership(self, squares: Float[Array, "B *F"], shape: tuple[int, ...]) -> Float[Array, "B H W"]:
+        """By the same weights at each square, where the tower still knows them apart."""
+        if self.tower == "conv":
+            return Convolution(1, 1, 1, _small_init, name=OWNERSHIP)(squares)[..., 0]
+        return dense(math.prod(shape[1:]), _small_init, name=OWNERSHIP)(squares).reshape(shape)
 
     def _shown(self, x: Float[Array, "*B F"]) -> Float[Array, "*B F"]:
         activated = nn.relu(x)
@@ -57,7 +86,7 @@ class BoardNetwork(nn.Module):
             x = x + dense(self.width, _small_init, name=f"block_{block}_b")(inner)
         return self._shown(x)
 
-    def _convolutions(self, board: Float[Array, "B H W C"]) -> Float[Array, "B F"]:
+    def _convolutions(self, board: Float[Array, "B H W C"]) -> Float[Array, "B H W F"]:
         def convolution(name: str, init: Callable[..., Array]) -> Convolution:
             return Convolution(self.width, 3, 1, init, same=True, name=name)
 
@@ -65,12 +94,12 @@ class BoardNetwork(nn.Module):
         for block in range(self.blocks):
             inner = self._shown(convolution(f"block_{block}_a", _hidden_init)(self._shown(x)))
             x = x + convolution(f"block_{block}_b", _small_init)(inner)
-        return self._shown(dense(self.width, _hidden_init, name="last")(self._shown(x).reshape((board.shape[0], -1))))
+        return self._shown(x)
 
 
-def board_network(actions: int, tower: str, width: int, blocks: int) -> Network:
-    """Parameters, boards ``[B, H, W, C]`` -> logits of the moves, logit of winning."""
-    module = BoardNetwork(actions, tower, width, blocks)
+def board_network(actions: int, tower: str, width: int, blocks: int, heads: tuple[str, ...] = ()) -> Network:
+    """Parameters, boards ``[B, H, W, C]`` -> logits of the moves, logit of winning and, with ``heads``, their ``BoardHeads``."""
+    module = BoardNetwork(actions, tower, width, blocks, heads)
     return Network(
         init=lambda key, board: module.init(key, board)["params"],
         apply=lambda params, board: module.apply({"params": params}, board),
