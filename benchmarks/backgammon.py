@@ -87,11 +87,12 @@ def against(rules: Compiled, policy: Player, other: Player, games: int) -> np.nd
     found = []
     for number in range(games):
         seats, seed = ((policy, other), SEED + number // 2) if number % 2 == 0 else ((other, policy), SEED + number // 2)
-        position, moves = rules.init(seed), []
+        position, moves, earlier = rules.init(seed), [], []
         while len(legal := rules.legal(position)):
-            choice = seats[rules.mover(position)].choose(Turn(BACKGAMMON, position, tuple(moves)))
+            choice = seats[rules.mover(position)].choose(Turn(BACKGAMMON, position, tuple(moves), tuple(earlier)))
             if choice.resigns or choice.action not in legal:
                 raise ValueError(f"game {number}, move {len(moves) + 1}: {choice.remark}")
+            earlier.append(position)
             position = rules.step(position, choice.action, seed, len(moves))
             moves.append(choice.action)
         found.append(rules.rewards(position)[number % 2])

@@ -97,6 +97,8 @@ class Turn(NamedTuple):
     position: Position
     moves: tuple[int, ...]
     """All actions from the beginning."""
+    earlier: tuple[Position, ...] = ()
+    """The positions in which they were played, for players that remember; empty where they were not kept."""
 
 
 class Player(NamedTuple):

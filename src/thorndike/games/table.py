@@ -303,7 +303,8 @@ class Table:
             with self._lock:
                 if self._task is not task:
                     return
-                turn = Turn(self.game, self._plies[number].position, task.moves)
+                earlier = tuple(ply.position for ply in self._plies[:number])
+                turn = Turn(self.game, self._plies[number].position, task.moves, earlier)
             try:
                 choice = seat.player.choose(turn)
             except Exception as error:
