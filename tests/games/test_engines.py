@@ -14,7 +14,7 @@ from thorndike.errors import UserError
 from thorndike.games.engine_player import engine_player
 from thorndike.games.engine_process import EngineFailure, EngineProcess
 from thorndike.games.engines import ENGINES, check_engine, engine, program_of
-from thorndike.games.game import Turn, named_action
+from thorndike.games.game import Stopped, Turn, named_action
 from thorndike.games.gtp import gtp_start
 from thorndike.games.registry import game
 from thorndike.games.uci import told_probability, uci_start
@@ -93,6 +93,21 @@ def test_it_follows_to_another_game_and_back(board, folder):
     assert heard.count("clear_board") == 2
     assert heard.endswith("play black a3\ngenmove white\nundo\n")
     player.close()
+
+
+@pytest.mark.parametrize("protocol", ["gtp", "uci"])
+def test_one_that_is_stopped_is_ended_and_started_again_when_it_is_asked(board, folder, protocol):
+    player, asked = player_of(folder, "hangs", protocol), []
+    start = board.init(jax.random.key(0))
+    player.choose(Turn(board.game, start, ()))
+    second = Turn(board.game, board.play(board.play(start, 4), 6), (4, 6), stopped=lambda: len(asked) > 1 or asked.append(1))
+    with pytest.raises(Stopped):
+        player.choose(second)
+    assert_gone(folder)
+    assert len(started(folder)) == 1, "it is not taken for a crash"
+    assert board.game.action_name(None, player.choose(Turn(board.game, start, ())).action) == "b2"
+    player.close()
+    assert_gone(folder)
 
 
 @pytest.mark.parametrize("protocol", ["gtp", "uci"])

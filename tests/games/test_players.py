@@ -8,13 +8,16 @@ import numpy as np
 import pytest
 
 from games.rules import KEY, Compiled
+from games.test_search import evaluate_made_up
 from thorndike.environments.wrappers import chain
 from thorndike.errors import UserError
+from thorndike.games import cut_search
 from thorndike.games.agent_player import agent_player
-from thorndike.games.game import Turn, named_action
+from thorndike.games.game import Stopped, Turn, named_action
 from thorndike.games.players import mcts_player, random_player
 from thorndike.games.plies import positions_before
 from thorndike.games.registry import game
+from thorndike.games.search import SEARCHES, SearchSettings, search
 from thorndike.networks.masking import MASK
 from thorndike.types import Algorithm, Needs
 
@@ -169,3 +172,30 @@ def test_of_dice_the_positions_decide_what_is_remembered(board):
         assert player.choose(Turn(dice, position, moves, (first,))).action == expected
     with pytest.raises(UserError, match=r"give Turn\.earlier"):
         player.choose(Turn(dice, position, moves))
+
+
+@pytest.mark.parametrize("kind", SEARCHES)
+def test_a_search_in_parts_finds_what_a_whole_one_finds(board, kind, monkeypatch):
+    settings, position, key = SearchSettings(kind, 50), turn(board, "a1 b2").position, jax.random.key(3)
+    at_once = jax.jit(lambda positions: search(board.game, evaluate_made_up, settings, (), positions, key, explore=False))
+    whole = at_once(jax.tree.map(lambda leaf: leaf[None], position))
+    monkeypatch.setattr(cut_search, "_FIRST", 7)
+    asked = []
+    look = cut_search.cut_search(board.game, evaluate_made_up, settings)
+    found = look((), position, key, lambda: bool(asked.append(1)))
+    for name, ours, theirs in zip(whole._fields, found, whole, strict=True):
+        # Programs of another shape round otherwise.
+        np.testing.assert_allclose(ours, theirs, rtol=1e-5, err_msg=name)
+    assert len(asked) > 2
+
+
+def test_a_search_that_is_stopped_ends_long_before_its_last_simulation(board):
+    player, left = mcts_player(board.game, 200_000, seed=1), [3]
+
+    def stopped():
+        left[0] -= 1
+        return left[0] == 0
+
+    with pytest.raises(Stopped):
+        player.choose(turn(board, "a1")._replace(stopped=stopped))
+    assert left == [0], "it asked twice in vain, before the first two parts"

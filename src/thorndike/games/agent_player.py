@@ -10,11 +10,12 @@ import numpy as np
 from jaxtyping import Array, Float, Key, PyTree
 
 from thorndike.errors import UserError
+from thorndike.games.cut_search import cut_search
 from thorndike.games.environment import observed_position
 from thorndike.games.game import Choice, Game, Player, Position, Turn
 from thorndike.games.players import choice_of
 from thorndike.games.plies import positions_before
-from thorndike.games.search import Evaluate, SearchSettings, search
+from thorndike.games.search import Evaluate, SearchSettings
 from thorndike.networks.masking import FORBIDDEN
 from thorndike.types import Algorithm, Wrapper
 
@@ -47,20 +48,18 @@ def agent_player(
     settings = _settings(config, max(simulations, 1))
     searches = simulations > 0 and game.num_players == 2 and not game.has_chance
 
-    def deep(position: Position) -> PyTree:
-        return search(game, evaluate, settings, actor, position, jax.random.key(0), explore=False)
+    deep = cut_search(game, evaluate, settings)
 
+    @jax.jit
     def plain(position: Position) -> tuple[Array, Array]:
-        logits, value = evaluate(actor, position, jax.random.key(0))
-        return jnp.argmax(jnp.where(jax.vmap(game.legal)(position), logits, FORBIDDEN), axis=-1), value
-
-    look = jax.jit(deep if searches else plain)
+        batch = jax.tree.map(lambda leaf: leaf[None], position)
+        logits, value = evaluate(actor, batch, jax.random.key(0))
+        return jnp.argmax(jnp.where(jax.vmap(game.legal)(batch), logits, FORBIDDEN), axis=-1), value
 
     def choose(turn: Turn) -> Choice:
-        found = look(jax.tree.map(lambda leaf: leaf[None], turn.position))
         if searches:
-            return choice_of(found)
-        action, value = jax.device_get(found)
+            return choice_of(deep(actor, turn.position, jax.random.key(0), turn.stopped))
+        action, value = jax.device_get(plain(turn.position))
         of_two = game.num_players == 2 and not game.has_chance
         return Choice(int(action[0]), min(max(float(value[0] + 1) / 2, 0.0), 1.0) if of_two else None)
 

@@ -144,14 +144,14 @@ def read_actors(
     ``statistics`` are the shapes of one seed's, by the wrapper's place in the chain. Raises ``UserError``.
     """
     shapes, structure = jax.tree.flatten(jax.eval_shape(algorithm.init, jax.random.key(0)))
-    acts = _looked_at(algorithm.actor, structure.unflatten(shapes))
-    part = structure.unflatten([_of_seeds(leaf, seeds) if used else None for leaf, used in zip(shapes, acts, strict=True)])
+    acts = _looked_at(algorithm.actor, jax.tree.unflatten(structure, shapes))
+    part = jax.tree.unflatten(structure, [_of_seeds(leaf, seeds) if used else None for leaf, used in zip(shapes, acts, strict=True)])
     held = {str(place): jax.tree.map(lambda leaf: _of_seeds(leaf, seeds), tree) for place, tree in statistics.items()}
     learner, learnt = read_tree((part, {"statistics": held} if compiled else held), SealedFolder(folder), STATE, part=True)
 
     def actor(part: PyTree) -> PyTree:
-        leaves = zip(shapes, structure.flatten_up_to(part), strict=True)
-        return algorithm.actor(structure.unflatten([shape if leaf is None else leaf for shape, leaf in leaves]))
+        leaves = zip(shapes, jax.tree.leaves(part, is_leaf=lambda leaf: leaf is None), strict=True)
+        return algorithm.actor(jax.tree.unflatten(structure, [shape if leaf is None else leaf for shape, leaf in leaves]))
 
     found = learnt["statistics"] if compiled else learnt
     return jax.vmap(actor)(learner), tuple(found[str(place)] for place in statistics)
