@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import thorndike as td
+from machine import origin
 from thorndike.games.environment import observed_position
 from thorndike.games.game import Player, Turn
 from thorndike.games.match import Compiled, compiled
@@ -111,7 +112,7 @@ def main() -> None:
     options = parser.parse_args()
     for run in options.runs:
         record = json.loads((run / "run.json").read_text(encoding="utf-8")) if (run / "run.json").exists() else {}
-        row: dict[str, object] = {name: record.get(name) for name in ("steps_done", "cpu_s", "compile_s", "seed")}
+        row: dict[str, object] = {**origin()} | {name: record.get(name) for name in ("steps_done", "cpu_s", "compile_s", "seed")}
         if options.games:
             row["random"] = described(against_random(run, options.games), pairs=False)
             print(run.name, row["random"], flush=True)

@@ -9,8 +9,6 @@ All games are played side by side to their end, by the policy's likeliest legal 
 
 import argparse
 import json
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,13 +16,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
+from scipy.special import stdtrit
 
 import thorndike as td
+from machine import origin
 from thorndike.games.environment import observed_position
 from thorndike.games.game import Position
 from thorndike.games.registry import game
 from thorndike.networks.masking import FORBIDDEN, MASK
-from thorndike.statistics.estimates import mean_interval
 
 ROOT = Path(__file__).parents[1]
 RESULT = ROOT / "benchmarks" / "results" / "2048.json"
@@ -92,10 +91,12 @@ def of_run(run: Path, games: int) -> dict[str, object]:
         rows.append(described(points, tiles))
         means.append(float(np.mean(points)))
         print(run.name, "seed", policy.first, rows[-1], flush=True)
-    low, high = mean_interval(np.array(means) if len(means) > 1 else points)
+    units = np.array(means) if len(means) > 1 else points
+    half = float(stdtrit(len(units) - 1, 0.975) * np.std(units, ddof=1) / len(units) ** 0.5)
     record = json.loads((run / "run.json").read_text(encoding="utf-8"))
     told = {name: record.get(name) for name in ("steps_done", "cpu_s", "compile_s", "seed", "preset", "git_commit", "command")}
-    return {**told, "mean_score": round(float(np.mean(means)), 1), "ci95": [round(low, 1), round(high, 1)], "seeds": rows}
+    mean = float(np.mean(means))
+    return {**told, "mean_score": round(mean, 1), "ci95": [round(mean - half, 1), round(mean + half, 1)], "seeds": rows}
 
 
 def main() -> None:
@@ -110,10 +111,8 @@ def main() -> None:
         rows[options.name or options.run.name] = of_run(options.run, options.games)
     if options.only_look:
         return
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True, cwd=ROOT).stdout.strip()
     results = json.loads(RESULT.read_text(encoding="utf-8")) if RESULT.exists() else {}
-    command = " ".join(["python benchmarks/play_2048.py", *sys.argv[1:]])
-    results |= {name: {"command": command, "commit": commit, **row} for name, row in rows.items()}
+    results |= {name: {**origin(), **row} for name, row in rows.items()}
     RESULT.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
 
 
