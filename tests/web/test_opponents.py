@@ -62,7 +62,7 @@ def test_no_search_where_there_is_none_or_it_takes_too_long(tmp_path, monkeypatc
     assert names("2048", tmp_path) == []
     assert names("backgammon", tmp_path) == ["GNU Backgammon", "Random moves"]
     assert names("chess", tmp_path) == ["Stockfish", "Fairy-Stockfish", "Random moves"]
-    assert names("go_9x9", tmp_path) == ["Tree search, without a network", "GNU Go", "Random moves"]
+    assert names("go_9x9", tmp_path) == ["Tree search, without a network", "GNU Go", "Pachi", "Random moves"]
 
 
 def test_a_program_that_is_not_installed_is_not_offered(tmp_path, monkeypatch):

@@ -39,7 +39,14 @@ ANOTHER_PERSON = Opponent(PERSON, "Another person, here", None)
 ALONE = Opponent(PERSON, "Nobody: one plays alone", None)
 _LONG = ("chess", "shogi", "go_19x19")
 """Games that take a search minutes to play out at random as often as it must."""
-_ENGINE_NAMES = {"gnugo": "GNU Go", "gnubg": "GNU Backgammon", "rhino": "grhino", "stockfish": "Stockfish", "fairy": "Fairy-Stockfish"}
+_ENGINE_NAMES = {
+    "gnugo": "GNU Go",
+    "pachi": "Pachi",
+    "gnubg": "GNU Backgammon",
+    "rhino": "grhino",
+    "stockfish": "Stockfish",
+    "fairy": "Fairy-Stockfish",
+}
 
 
 def is_for_one(game_id: str) -> bool:
