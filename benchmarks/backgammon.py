@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import thorndike as td
+from machine import origin
 from thorndike.games.environment import observed_position
 from thorndike.games.game import Player, Turn
 from thorndike.games.match import Compiled, compiled
@@ -87,11 +88,12 @@ def against(rules: Compiled, policy: Player, other: Player, games: int) -> np.nd
     found = []
     for number in range(games):
         seats, seed = ((policy, other), SEED + number // 2) if number % 2 == 0 else ((other, policy), SEED + number // 2)
-        position, moves = rules.init(seed), []
+        position, moves, earlier = rules.init(seed), [], []
         while len(legal := rules.legal(position)):
-            choice = seats[rules.mover(position)].choose(Turn(BACKGAMMON, position, tuple(moves)))
+            choice = seats[rules.mover(position)].choose(Turn(BACKGAMMON, position, tuple(moves), tuple(earlier)))
             if choice.resigns or choice.action not in legal:
                 raise ValueError(f"game {number}, move {len(moves) + 1}: {choice.remark}")
+            earlier.append(position)
             position = rules.step(position, choice.action, seed, len(moves))
             moves.append(choice.action)
         found.append(rules.rewards(position)[number % 2])
@@ -110,7 +112,7 @@ def main() -> None:
     options = parser.parse_args()
     for run in options.runs:
         record = json.loads((run / "run.json").read_text(encoding="utf-8")) if (run / "run.json").exists() else {}
-        row: dict[str, object] = {name: record.get(name) for name in ("steps_done", "cpu_s", "compile_s", "seed")}
+        row: dict[str, object] = {**origin()} | {name: record.get(name) for name in ("steps_done", "cpu_s", "compile_s", "seed")}
         if options.games:
             row["random"] = described(against_random(run, options.games), pairs=False)
             print(run.name, row["random"], flush=True)

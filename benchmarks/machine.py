@@ -3,7 +3,9 @@
 import json
 import os
 import platform
+import shlex
 import subprocess
+import sys
 from pathlib import Path
 
 PACKAGES = (
@@ -44,6 +46,14 @@ def commit(root: Path) -> str:
     changes = ["git", "-C", str(root), "status", "--porcelain", "--", "src", "benchmarks/*.py", "benchmarks/peers"]
     changed = subprocess.run(changes, capture_output=True, text=True, check=False).stdout.strip()
     return told.stdout.strip() + ("+" if changed else "")
+
+
+def origin() -> dict[str, str]:
+    """What every row of results says of itself: the command line, and the commit."""
+    return {
+        "command": shlex.join(["python", f"benchmarks/{Path(sys.argv[0]).name}", *sys.argv[1:]]),
+        "commit": commit(Path(__file__).parents[1]),
+    }
 
 
 def versions(python: Path) -> dict[str, str]:

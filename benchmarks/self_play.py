@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import mctx
 import pgx
 
+from machine import origin
 from thorndike.algorithms.alphazero import Config, alphazero
 from thorndike.games.connect_four import CONNECT_FOUR
 from thorndike.games.environment import game_environment
@@ -168,6 +169,7 @@ def main() -> None:
     ratios = [round(theirs / own, 3) for own, theirs in zip(spent["ours"], spent["pgx and mctx"], strict=True)]
     shares = {name: round(median(spent[name]) / median(spent["ours"]), 3) for name in ("network", "game")}
     row = {
+        **origin(),
         **vars(options),
         "positions_per_cpu_s": {name: median(values) for name, values in rates.items()},
         "rounds_positions_per_cpu_s": rates,

@@ -26,6 +26,7 @@ import optax
 import pgx
 
 from connect_four import labelled, positions_of
+from machine import origin
 from thorndike.algorithms.alphazero import Config, alphazero
 from thorndike.environments.wrappers import chain
 from thorndike.games.connect_four import CONNECT_FOUR
@@ -250,7 +251,7 @@ def measure(name: str, budget: float, seed: int, first: float) -> None:
             points.append({"cpu_s": round(seconds, 1), "positions": positions, "errors": judge(choose)})
             print(name, points[-1], flush=True)
             results = json.loads(RESULT.read_text(encoding="utf-8")) if RESULT.exists() else {}
-            results[name] = {"seed": seed, "simulations": SIMULATIONS, "points": points}
+            results[name] = {**origin(), "seed": seed, "simulations": SIMULATIONS, "points": points}
             RESULT.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
 
 

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import thorndike as td
+from machine import origin
 from thorndike.games.connect_four import CONNECT_FOUR
 from thorndike.games.environment import observed_position, opening
 from thorndike.games.search import SearchSettings, search
@@ -60,7 +61,7 @@ def main() -> None:
         found = shares(kind, simulations, explore)
         quarter, half, three = np.quantile(found, [0.25, 0.5, 0.75])
         name = f"{kind}, {simulations} simulations, {'self-play' if explore else 'for strength'}"
-        results[name] = {"positions": len(found), "mean": round(float(np.mean(found)), 3)}
+        results[name] = {**origin(), "positions": len(found), "mean": round(float(np.mean(found)), 3)}
         results[name] |= {"quartiles": [round(float(x), 3) for x in (quarter, half, three)]}
         print(name, results[name], f"({time.process_time() - began:.0f} CPU-s)", flush=True)
         RESULT.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")

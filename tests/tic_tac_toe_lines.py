@@ -106,12 +106,13 @@ def walk(choose: Choose, agent: int) -> Lines:
     return Lines(found[1], found[0], found[-1])
 
 
-def chooser(run: Path, simulations: int) -> Choose:
-    """The policy of a run of alphazero or muzero, with that many simulations a move."""
+def chooser(run: Path, simulations: int, seed: int = 0) -> Choose:
+    """The policy of a run, with that many simulations a move where it searches."""
     loaded = td.load(run)
     policy, facts = loaded.policy, loaded.facts
-    algorithm = build_algorithm(facts["algorithm"], {**facts["config"], "eval_simulations": simulations}, policy.spec, None)
-    actor, noise = jax.tree.map(lambda leaf: leaf[0], policy.actors), policy.noise(jax.random.key(0), SIDE_BY_SIDE)
+    searches = {"eval_simulations": simulations} if "eval_simulations" in facts["config"] else {}
+    algorithm = build_algorithm(facts["algorithm"], facts["config"] | searches, policy.spec, None)
+    actor, noise = jax.tree.map(lambda leaf: leaf[seed], policy.actors), policy.noise(jax.random.key(0), SIDE_BY_SIDE)
     see = jax.vmap(lambda position: observed_position(TIC_TAC_TOE, position))
     return jax.jit(lambda positions: algorithm.greedy(actor, algorithm.memory(SIDE_BY_SIDE), see(positions), noise)[1])
 

@@ -59,7 +59,12 @@ _LEARNT_FROM = Kind(
     "a path and a sha256",
     lambda value: isinstance(value, dict) and set(value) == {"path", "sha256"} and all(map(TEXT.admits, value.values())),
 )
-_OF_LATER: Mapping[str, Kind] = {"dataset": optional(_LEARNT_FROM), "start_from": optional(TEXT), "reward": optional(_LEARNT_FROM)}
+_OF_LATER: Mapping[str, Kind] = {
+    "dataset": optional(_LEARNT_FROM),
+    "start_from": optional(TEXT),
+    "reward": optional(_LEARNT_FROM),
+    "keep_checkpoints": optional(whole(2)),
+}
 _OF_POLICY: Mapping[str, Kind] = {**_SHARED, "observation_space": OBJECT, "action_space": OBJECT, "best": whole(0, _MOST)}
 
 

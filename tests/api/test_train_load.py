@@ -54,6 +54,19 @@ def test_the_result_says_what_was_done(trained):
     assert 8 <= trained.mean_return <= 100, "a new policy's CartPole falls after about 20 steps"
 
 
+def test_a_checkpoint_is_a_policy_too(run):
+    newest, last, older = td.load(run), td.load(run, checkpoint=320), td.load(run, checkpoint=160)
+    for one in ("actors", "statistics"):
+        ours, theirs, before = (jax.tree.leaves(getattr(each.policy, one)) for each in (newest, last, older))
+        assert all(map(np.array_equal, ours, theirs))
+        assert not any(map(np.array_equal, ours, before))
+    assert (older.checkpoint, older.seeds[1].checkpoint, newest.checkpoint) == (160, 160, None)
+    assert older.evaluate(episodes=2).mean > 0
+    assert not (run / "evaluations.jsonl").exists(), "they are the run's own, which its newest policy plays"
+    with pytest.raises(UserError, match="has no checkpoint of step 7: it has those of 160, 320"):
+        td.load(run, checkpoint=7)
+
+
 def test_the_run_directory_holds_all_of_it(trained):
     record = read_run(trained.run)
     expected = {

@@ -4,6 +4,7 @@ import io
 import json
 import math
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,9 +14,12 @@ from pathlib import Path
 import pytest
 
 import thorndike as td
+from made_up_runs import write_run
 from thorndike.cli.arena import _elo
+from thorndike.cli.choose_player import choose_player
 from thorndike.cli.main import main
 from thorndike.games.sgf import read_sgf
+from thorndike.games.trained import trained_run
 
 FAKE = Path(__file__).parents[1] / "games" / "fake_engine.py"
 pytestmark = pytest.mark.usefixtures("quick_compile")
@@ -210,12 +214,36 @@ def test_the_public_api_plays(place):
         td.arena("tic_tac_toe", ["random"])
 
 
+def test_a_checkpoint_is_named_by_its_step(place):
+    run = write_run(place / "runs/tic_tac_toe/alphazero/20260101-000000-a", algorithm="alphazero", environment="tic_tac_toe", seeds=1)
+    shutil.copytree(trained_run("tic_tac_toe") / "policy", run / "policy", dirs_exist_ok=True)
+    (run / "checkpoints" / "4000").mkdir(parents=True)
+    for text in ("latest@4000", "20260101@4000", f"{run}@4000"):
+        assert choose_player(text, "tic_tac_toe", place / "runs") == Path(f"{run}@4000")
+    for text in ("latest@40", "latest@now", "latest@"):
+        with pytest.raises(td.UserError, match=f"has no checkpoint of step {text[7:]}: it has those of 4000"):
+            choose_player(text, "tic_tac_toe", place / "runs")
+    with pytest.raises(td.UserError, match="has no checkpoint of step 5: it has those of 4000"):
+        td.player(f"{run}@5", "tic_tac_toe")
+    with pytest.raises(td.UserError, match="there is no player 'other@4000'"):
+        choose_player("other@4000", "tic_tac_toe", place / "runs")
+    named = run.rename(run.with_name("20260101-000000-me@4000"))
+    assert choose_player(str(named), "tic_tac_toe", place / "runs") == named
+
+
 @pytest.mark.slow
 def test_a_trained_run_plays(place, capsys):
-    run = td.train("alphazero", "tic_tac_toe", steps=512, num_envs=8, settings={"learning_starts": 64, "batch_size": 32}).run
+    run = td.train(
+        "alphazero", "tic_tac_toe", steps=512, num_envs=8, settings={"learning_starts": 64, "batch_size": 32}, checkpoint_every=256
+    ).run
     assert main(["arena", "tic_tac_toe", "latest", "random", "--games", "4", "--simulations", "8", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["players"][0]["player"] == f"{run.name}:simulations=8"
+    assert main(["arena", "tic_tac_toe", "latest", "latest@256", "--games", "4", "--simulations", "0", "--json"]) == 0
+    assert [row["player"] for row in json.loads(capsys.readouterr().out)["players"]] == [
+        f"{run.name}:simulations=0",
+        f"{run.name}@256:simulations=0",
+    ]
     assert main(["arena", "connect_four", "latest", "random"]) == 2
     assert "was trained on tic_tac_toe, not on connect_four" in capsys.readouterr().err
     assert td.play_match("tic_tac_toe", run, td.load(run), games=2, simulations=0).tally.total.games == 2

@@ -30,7 +30,7 @@ def main(protocol, fault, folder):
             if fault == "stays":
                 time.sleep(600)
             return
-        if protocol == "gtp" and words[0] not in ("genmove",):
+        if protocol == "gtp" and words[0] not in ("genmove", "kgs-genmove_cleanup"):
             if fault == "refuses":
                 say("? unknown command\n")
             elif fault == "babbles":

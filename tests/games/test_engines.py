@@ -14,7 +14,7 @@ from thorndike.errors import UserError
 from thorndike.games.engine_player import engine_player
 from thorndike.games.engine_process import EngineFailure, EngineProcess
 from thorndike.games.engines import ENGINES, check_engine, engine, program_of
-from thorndike.games.game import Turn, named_action
+from thorndike.games.game import Stopped, Turn, named_action
 from thorndike.games.gtp import gtp_start
 from thorndike.games.registry import game
 from thorndike.games.uci import told_probability, uci_start
@@ -93,6 +93,21 @@ def test_it_follows_to_another_game_and_back(board, folder):
     assert heard.count("clear_board") == 2
     assert heard.endswith("play black a3\ngenmove white\nundo\n")
     player.close()
+
+
+@pytest.mark.parametrize("protocol", ["gtp", "uci"])
+def test_one_that_is_stopped_is_ended_and_started_again_when_it_is_asked(board, folder, protocol):
+    player, asked = player_of(folder, "hangs", protocol), []
+    start = board.init(jax.random.key(0))
+    player.choose(Turn(board.game, start, ()))
+    second = Turn(board.game, board.play(board.play(start, 4), 6), (4, 6), stopped=lambda: len(asked) > 1 or asked.append(1))
+    with pytest.raises(Stopped):
+        player.choose(second)
+    assert_gone(folder)
+    assert len(started(folder)) == 1, "it is not taken for a crash"
+    assert board.game.action_name(None, player.choose(Turn(board.game, start, ())).action) == "b2"
+    player.close()
+    assert_gone(folder)
 
 
 @pytest.mark.parametrize("protocol", ["gtp", "uci"])
@@ -187,6 +202,32 @@ def test_short_names_are_checked_at_once(monkeypatch):
         check_engine("rhino", "othello")
 
 
+def test_pachi_is_looked_for_on_the_path_and_told_how_much_to_think(board, folder, monkeypatch):
+    """A program that notes its words and then plays as the others here do."""
+    places = [folder / name for name in ("bin", "games")]
+    for place in places:
+        place.mkdir()
+        (place / "pachi").write_text(f'#!/bin/sh\necho "$@" > {folder}/words\nexec {sys.executable} {FAKE} gtp none {folder}\n')
+        (place / "pachi").chmod(0o755)
+    monkeypatch.setattr("thorndike.games.engines._BEYOND_PATH", str(places[1]))
+    monkeypatch.setenv("PATH", "/nowhere")
+    with pytest.raises(UserError, match=r"pachi is not installed; build it from https://github.com/pasky/pachi \(no package of Debian's\)"):
+        engine("pachi", "go_9x9")
+    monkeypatch.setenv("PATH", f"{places[1]}{os.pathsep}{places[0]}")
+    assert program_of(ENGINES["pachi"]) == str(places[0] / "pachi")
+    player = engine("pachi:simulations=300,seed=5", "go_9x9")
+    # Its board is smaller, but the first two moves are on both.
+    (folder / "moves").write_text("B2 C1")
+    rules = game("go_9x9")
+    assert rules.action_name(None, player.choose(Turn(rules, rules.init(jax.random.key(0)), ())).action) == "B2"
+    player.close()
+    assert (folder / "words").read_text() == "-d 0 -r chinese -t =300 -s 5 threads=1\n"
+    heard = (folder / "heard").read_text()
+    assert heard.startswith("boardsize 9\nclear_board\nkomi 7.5\n") and "kgs-genmove_cleanup black\n" in heard
+    with pytest.raises(UserError, match="pachi: simulations is a whole number from 1"):
+        engine("pachi:simulations=0", "go_9x9")
+
+
 def test_probabilities_of_winning_are_read_from_thoughts():
     assert told_probability(["info", "depth", "3", "score", "cp", "0", "nodes", "5"], None) == 0.5
     assert told_probability(["info", "score", "mate", "-3"], 0.4) == 0.0
@@ -208,7 +249,9 @@ def installed(names):
     return found
 
 
-@pytest.mark.parametrize(("name", "id"), installed([("rhino:level=1", "othello"), ("gnugo:level=1", "go_9x9")]))
+@pytest.mark.parametrize(
+    ("name", "id"), installed([("rhino:level=1", "othello"), ("gnugo:level=1", "go_9x9"), ("pachi:simulations=300", "go_9x9")])
+)
 def test_real_engines_beat_random_moves_as_either_side(name, id, quick_compile):
     rules, random = Compiled(game(id)), np.random.default_rng(1)
     player = engine(name, id)

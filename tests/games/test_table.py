@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from thorndike.errors import UserError
-from thorndike.games.game import Choice, Player, Turn
+from thorndike.games.game import Choice, Player, Stopped, Turn
 from thorndike.games.plies import line_names, target_square
 from thorndike.games.registry import game
 from thorndike.games.saved_game import read_saved_game, saved_actions, saved_game_file
@@ -32,6 +32,30 @@ def held(gate: threading.Event, closed: threading.Event | None = None, asked: th
         return lowest(turn)
 
     return Player("Held", choose, closed.set if closed else lambda: None)
+
+
+class Endless:
+    """Thinks until it is told to stop."""
+
+    def __init__(self):
+        self.asked, self.ended, self.count = threading.Event(), threading.Event(), 0
+        self.player = Player("Endless", self.choose)
+
+    def choose(self, turn: Turn) -> Choice:
+        self.count += 1
+        self.ended.clear()
+        self.asked.set()
+        ends = time.monotonic() + 20
+        while not turn.stopped():
+            assert time.monotonic() < ends
+            time.sleep(0.001)
+        self.ended.set()
+        raise Stopped
+
+    def begins(self) -> bool:
+        begun = self.asked.wait(20)
+        self.asked.clear()
+        return begun
 
 
 def until(condition, seconds: float = 20.0) -> None:
@@ -289,3 +313,43 @@ def test_a_move_of_two_clicks():
     with pytest.raises(UserError, match="b2 cannot go to a3"):
         table.click((0, 0))
     assert table.view().moves == (0,) and table.view().pending == ((1, 1),)
+
+
+@pytest.mark.parametrize(
+    "end",
+    [
+        lambda table: table.interrupt(),
+        lambda table: table.take_back(),
+        lambda table: table.restart(),
+        lambda table: table.seat((person("A"), person("B"))),
+        lambda table: table.close(),
+    ],
+    ids=["stop", "take back", "new game", "another opponent", "end of the studio"],
+)
+def test_whoever_is_not_waited_for_any_more_is_told_to_stop(end):
+    thinker = Endless()
+    table = Table(TIC_TAC_TOE, (person(), computer(thinker.player)))
+    table.click((1, 1))
+    assert thinker.begins()
+    end(table)
+    assert thinker.ended.wait(20)
+    assert table.view().thinking is None and not table.view().notice
+
+
+def test_nobody_thinks_while_nobody_looks():
+    thinker = Endless()
+    table = Table(TIC_TAC_TOE, (person(), computer(thinker.player)))
+    first, second = table.listen(lambda: None), table.listen(lambda: None)
+    table.click((1, 1))
+    assert thinker.begins()
+    first()
+    first()
+    time.sleep(0.05)
+    assert not thinker.ended.is_set(), "the other page is still open"
+    second()
+    assert thinker.ended.wait(20)
+    assert table.view().thinking is None and not table.view().paused
+    again = table.listen(lambda: None)
+    assert thinker.begins() and table.view().thinking == "Endless"
+    again()
+    assert thinker.ended.wait(20) and thinker.count == 2

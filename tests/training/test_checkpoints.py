@@ -15,12 +15,13 @@ from safetensors.numpy import save
 
 from thorndike.errors import UserError
 from thorndike.training import tree_files
-from thorndike.training.checkpoints import Progressed, restore, save_checkpoint
+from thorndike.training.checkpoints import Progressed, read_actors, restore, save_checkpoint
 from thorndike.training.json_files import as_bytes
 from thorndike.training.run_directory import checkpoints
 from thorndike.training.runner import Runner
 from thorndike.training.sealed_folders import NewFolder, SealedFolder, intact
 from thorndike.training.segment import Carry
+from thorndike.types import Algorithm
 from training.damage import DAMAGES, HOSTILE, seal_again
 from training.faulty_disk import Dead, disk, dying_at, failing_at
 
@@ -53,6 +54,12 @@ RUNNER = runner_of(carry_at(0))
 
 def save_at(run: Path, iteration: int) -> None:
     save_checkpoint(run, carry_at(iteration), None, Progressed(iteration, 1.5, 2.5), PER_ITERATION, REQUEST)
+
+
+def learning(init, actor) -> Algorithm:
+    """One that does nothing but begin and act."""
+    rest = dict.fromkeys(("memory", "draw", "act", "greedy", "value", "update", "observe", "needs"))
+    return Algorithm(init=init, actor=actor, **rest)
 
 
 def restored(run: Path, request: dict = REQUEST) -> int:
@@ -297,3 +304,35 @@ def test_lines_logged_after_the_checkpoint_are_dropped(run):
 def test_without_a_checkpoint_that_is_said(tmp_path):
     with pytest.raises(UserError, match="no intact checkpoint to go on from; train again"):
         restore(tmp_path, RUNNER, None)
+
+
+def test_as_many_checkpoints_stay_as_are_asked_for_and_the_newest_two_share_nothing(tmp_path):
+    for iteration in range(1, 6):
+        save_checkpoint(tmp_path, carry_at(iteration), None, Progressed(iteration, 1.5, 2.5), PER_ITERATION, REQUEST, keep=4)
+    assert [path.name for path in checkpoints(tmp_path)] == ["20", "30", "40", "50"]
+    files = [{path.stat().st_ino for path in folder.iterdir()} for folder in checkpoints(tmp_path)]
+    assert not files[-1] & files[-2]
+    assert restored(tmp_path) == 5
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_what_acts_is_read_without_the_replay(tmp_path, monkeypatch, compiled):
+    """Two seeds; a wrapper that is not asked for stands before the one whose statistics are."""
+
+    def learner(count):
+        return {"params": jnp.full((3, 2), count, jnp.float32), "ring": jnp.zeros(LONG) + count, "count": jnp.int32(count)}
+
+    def both(tree):
+        return jax.tree.map(lambda leaf: jnp.stack([leaf, leaf + 1]), tree)
+
+    held = {"mean": jnp.arange(4.0)}
+    statistics = ({"seen": jnp.ones(())}, held)
+    source = {"environment": jnp.zeros(()), "statistics": statistics} if compiled else statistics
+    algorithm = learning(lambda key: learner(0), lambda state: {"policy": state["params"] * state["count"]})
+    save_checkpoint(tmp_path, Carry(both(learner(3)), both(source), jax.random.key(9)), None, Progressed(1, 1.5, 2.5), PER_ITERATION)
+    read = []
+    monkeypatch.setattr(SealedFolder, "read", lambda self, name, plain=SealedFolder.read: read.append(name) or plain(self, name))
+    actors, learnt = read_actors(tmp_path / "checkpoints" / "10", algorithm, {1: jax.eval_shape(lambda: held)}, 2, compiled)
+    np.testing.assert_array_equal(actors["policy"], np.stack([np.full((3, 2), 9.0), np.full((3, 2), 16.0)]))
+    np.testing.assert_array_equal(learnt[0]["mean"], np.stack([np.arange(4.0), np.arange(4.0) + 1]))
+    assert sorted(read) == ["state.blocks.json", "state.safetensors"]

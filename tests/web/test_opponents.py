@@ -38,6 +38,19 @@ def test_runs_of_this_game_come_first_the_newest_before_the_others(tmp_path):
     assert found[-1] == "Random moves"
 
 
+def test_checkpoints_before_the_newest_are_offered_too(tmp_path):
+    run = write_run(tmp_path / "a" / "ppo" / "20260101-000000-old", environment="tic_tac_toe", seeds=1)
+    for step in (4000, 12000, 800):
+        (run / "checkpoints" / str(step)).mkdir(parents=True)
+    offered = opponents_in(tmp_path)("tic_tac_toe")
+    assert [each.name for each in offered[:3]] == [
+        "Trained: ppo, 20260101-000000-old",
+        "Trained: ppo, 20260101-000000-old, at step 4,000",
+        "Trained: ppo, 20260101-000000-old, at step 800",
+    ]
+    assert [each.id for each in offered[1:3]] == [f"{run}@4000", f"{run}@800"]
+
+
 def test_a_damaged_run_is_left_out(tmp_path):
     run = write_run(tmp_path / "a" / "20260101-000000-old", environment="tic_tac_toe", seeds=1)
     (run / "run.json").write_text("{")
@@ -49,7 +62,7 @@ def test_no_search_where_there_is_none_or_it_takes_too_long(tmp_path, monkeypatc
     assert names("2048", tmp_path) == []
     assert names("backgammon", tmp_path) == ["GNU Backgammon", "Random moves"]
     assert names("chess", tmp_path) == ["Stockfish", "Fairy-Stockfish", "Random moves"]
-    assert names("go_9x9", tmp_path) == ["Tree search, without a network", "GNU Go", "Random moves"]
+    assert names("go_9x9", tmp_path) == ["Tree search, without a network", "GNU Go", "Pachi", "Random moves"]
 
 
 def test_a_program_that_is_not_installed_is_not_offered(tmp_path, monkeypatch):

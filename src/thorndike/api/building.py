@@ -22,6 +22,7 @@ from thorndike.networks.torso import is_image
 from thorndike.replay.hindsight import goal_of
 from thorndike.suggestions import did_you_mean
 from thorndike.training.actor_threads import SCHEDULES, ActorThreads, threaded_source
+from thorndike.training.checkpoints import KEPT
 from thorndike.training.dataset_source import ENGINE, dataset_source, dataset_spec
 from thorndike.training.datasets import Dataset, read_dataset
 from thorndike.training.devices import devices_for
@@ -75,6 +76,8 @@ class Request(NamedTuple):
     """The offline run whose networks and dataset it began with."""
     reward: dict[str, str] | None = None
     """``path`` and ``sha256`` of the learnt reward that it began with, in place of the environment's own."""
+    keep_checkpoints: int = KEPT
+    """How many of the newest stay."""
 
 
 class Lanes(NamedTuple):
@@ -192,6 +195,7 @@ def full_request(
     data: Dataset | None = None,
     start_from: str | None = None,
     reward: dict[str, str] | None = None,
+    keep_checkpoints: int = KEPT,
 ) -> Request:
     """What was asked for, and what the preset and the defaults add to it."""
     check_actors(algorithm, choice, actors)
@@ -215,6 +219,7 @@ def full_request(
         dataset=None if data is None else {"path": str(data.path.absolute()), "sha256": data.sha256},
         start_from=start_from,
         reward=reward,
+        keep_checkpoints=keep_checkpoints,
     )
 
 

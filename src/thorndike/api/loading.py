@@ -31,9 +31,12 @@ LONGEST_EPISODE = 10_000
 class LoadedPolicy:
     """A trained policy with the environment it was trained on. With several seeds it acts as the best; ``seeds[i]`` is any other."""
 
-    def __init__(self, policy: Policy, facts: dict, environment: EnvironmentLike | None) -> None:
-        """``facts`` is the content of policy.json; ``environment`` the object trained on, if it was no id."""
+    def __init__(self, policy: Policy, facts: dict, environment: EnvironmentLike | None, checkpoint: int | None = None) -> None:
+        """``facts`` is the content of policy.json; ``environment`` the object trained on, if it was no id; ``checkpoint`` its step, if it
+        is one.
+        """
         self._policy = policy
+        self.checkpoint = checkpoint
         self.facts = facts
         self._environment = environment
         self.predict = policy.predict
@@ -57,17 +60,17 @@ class LoadedPolicy:
     @property
     def seeds(self) -> Sequence["LoadedPolicy"]:
         """Each agent as a policy of its own."""
-        return [LoadedPolicy(policy, self.facts, self._environment) for policy in self._policy.seeds]
+        return [LoadedPolicy(policy, self.facts, self._environment, self.checkpoint) for policy in self._policy.seeds]
 
     def evaluate(self, episodes: int = 100, seed: int = 0, num_envs: int | None = None, deterministic: bool = True) -> Evaluation:
-        """Run every seed on fresh reference environments; the episodes are appended to the run's evaluations.jsonl.
+        """Run every seed on fresh reference environments; the episodes are appended to the run's evaluations.jsonl, but for a checkpoint's.
 
         An environment without a time limit gets one of ``LONGEST_EPISODE`` steps.
         """
         build = reference_engines(self.choice(), self._policy.spec.observation_space)
         gamma = None if self.incomparable_values is not None else cast(float, self.facts["config"]["gamma"])
         found = evaluate(self._policy, build, episodes, seed, num_envs or 20, deterministic, gamma)
-        if self.run is not None:
+        if self.run is not None and self.checkpoint is None:
             settings = {"evaluation_seed": seed, "deterministic": deterministic}
             names = {"total": "return", "discounted": "discounted_return"}
             rows = [{names.get(key, key): value for key, value in row._asdict().items()} for row in found.rows]
@@ -116,15 +119,17 @@ def _maker(choice: registry.Choice, space: gymnasium.Space) -> Callable[..., gym
     return mask_in_observation(make) if has_mask(space) else make
 
 
-def load(run: str | Path, *, environment: EnvironmentLike | None = None, network: Callable | None = None) -> LoadedPolicy:
-    """The trained policy of a run.
+def load(
+    run: str | Path, *, environment: EnvironmentLike | None = None, network: Callable | None = None, checkpoint: int | None = None
+) -> LoadedPolicy:
+    """The trained policy of a run, or of its ``checkpoint`` at this step.
 
     ``environment`` and ``network`` are needed again where they were Python objects. Raises ``UserError`` if the run has no intact policy
     yet.
     """
     run = Path(run)
-    policy, facts = read_policy(run, network)
-    return LoadedPolicy(policy, facts, environment)
+    policy, facts = read_policy(run, network, checkpoint)
+    return LoadedPolicy(policy, facts, environment, checkpoint)
 
 
 def evaluate_run(run: str | Path, episodes: int = 100, seed: int = 0, deterministic: bool = True) -> Evaluation:

@@ -16,13 +16,14 @@ from thorndike.games.match import Match, as_record
 from thorndike.games.match import play_match as play
 from thorndike.games.match_file import PlayedGame
 from thorndike.games.pgn import write_pgn
-from thorndike.games.player_names import MCTS, RANDOM, TRAINED, check_player, mcts_simulations
+from thorndike.games.player_names import MCTS, RANDOM, TRAINED, check_player, mcts_simulations, split_checkpoint
 from thorndike.games.players import mcts_player, random_player
 from thorndike.games.registry import game as find_game
 from thorndike.games.registry import is_game
 from thorndike.games.sgf import can_be_sgf, write_sgf
 from thorndike.games.trained import trained_run
 from thorndike.statistics.ratings import Games, Ratings, fit_ratings
+from thorndike.training.run_directory import checkpoint_of
 
 PlayerLike: TypeAlias = str | Path | Player | LoadedPolicy
 Progress: TypeAlias = Callable[[PlayedGame], None]
@@ -38,7 +39,8 @@ class Arena(NamedTuple):
 
 
 def player(who: PlayerLike, game: Game | str, *, simulations: int = SIMULATIONS, seed: int = 0) -> Player:
-    """A player of a game by a text: ``random``, ``mcts:simulations=400``, ``gnugo:level=3``, ``stockfish:elo=1500``, or a run's directory.
+    """A player of a game by a text: ``random``, ``mcts:simulations=400``, ``gnugo:level=3``, ``stockfish:elo=1500``, or a run's directory,
+    with ``@STEP`` behind it for one of its checkpoints.
 
     Runs, and ``mcts`` where it does not say, search ``simulations`` positions a move. Raises UserError for one that is not known, or cannot
     play this game.
@@ -56,12 +58,12 @@ def player(who: PlayerLike, game: Game | str, *, simulations: int = SIMULATIONS,
             return engine(who, rules.id)
     if who == TRAINED:
         return _agent(TRAINED, load(cast(Path, trained_run(rules.id))), rules, simulations)
-    loaded = who if isinstance(who, LoadedPolicy) else load(who)
+    loaded = who if isinstance(who, LoadedPolicy) else _loaded(str(who))
     trained_on = str(loaded.facts["environment"])
     # A game of the user's own is called by its file or module where it was trained by its name.
     if trained_on != rules.id and not (is_game(trained_on) and find_game(trained_on).id == rules.id):
         raise UserError(f"{loaded.run} was trained on {trained_on}, not on {rules.id}")
-    return _agent(loaded.run.name if loaded.run is not None else "agent", loaded, rules, simulations)
+    return _agent(_label(loaded), loaded, rules, simulations)
 
 
 def play_match(
@@ -145,6 +147,17 @@ def _played(
 def _rows(pair: tuple[int, int], match: Match) -> list[Games]:
     first, second = match.tally.moving_first, match.tally.moving_second
     return [Games(*pair, *first), Games(pair[1], pair[0], second.losses, second.draws, second.wins)]
+
+
+def _loaded(text: str) -> LoadedPolicy:
+    run, step = split_checkpoint(text)
+    return load(run, checkpoint=None if step is None else int(checkpoint_of(Path(run), step).name))
+
+
+def _label(loaded: LoadedPolicy) -> str:
+    if loaded.run is None:
+        return "agent"
+    return loaded.run.name if loaded.checkpoint is None else f"{loaded.run.name}@{loaded.checkpoint}"
 
 
 def _agent(label: str, loaded: LoadedPolicy, rules: Game, simulations: int) -> Player:

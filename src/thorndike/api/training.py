@@ -29,7 +29,7 @@ from thorndike.learning_sources import check_source, is_dataset
 from thorndike.networks.network import NetworkBuilder
 from thorndike.records import read_record
 from thorndike.training.actor_threads import ActorThreads
-from thorndike.training.checkpoints import restore, save_checkpoint
+from thorndike.training.checkpoints import KEPT, restore, save_checkpoint
 from thorndike.training.datasets import read_dataset
 from thorndike.training.faults import locate
 from thorndike.training.json_files import Json
@@ -65,6 +65,7 @@ def train(
     output: str | Path = "runs",
     name: str | None = None,
     checkpoint_every: int | None = None,
+    keep_checkpoints: int = KEPT,
     max_episode_steps: int | None = None,
     wrappers: Sequence[Wrapper] | None = None,
     network: NetworkBuilder | None = None,
@@ -90,10 +91,11 @@ def train(
     divides; that changes how long it takes and no result. ``env_timeout`` is how many seconds a step of an environment in a process of
     its own may take (60 by default), a reset twice that. ``actor_threads`` play host environments while the learner learns, each a pool of
     ``num_envs`` of its own, on the ``fixed`` schedule, which can be repeated, or the ``free`` one; ``env_restarts`` is how often a pool may
-    be made anew. ``reward`` is a folder of clips, or a reward learnt in one; ``until`` pauses at a step. Raises ``UserError``.
+    be made anew. ``reward`` is a folder of clips, or a reward learnt in one; ``until`` pauses at a step; the ``keep_checkpoints`` newest
+    stay. Raises ``UserError``.
     """
     check_algorithm(algorithm)
-    _check_numbers(seed, seeds, num_envs)
+    _check_numbers(seed, seeds, num_envs, keep_checkpoints)
     check_source(algorithm, environment)
     of_stepping: dict[str, object] = {"num_envs": num_envs, "wrappers": wrappers, "start_from": start_from, "devices": devices}
     of_stepping |= {"actor_threads": actor_threads, "env_restarts": env_restarts, "reward": reward, "until": until}
@@ -110,8 +112,9 @@ def train(
     actors = ActorThreads(actor_threads, actor_schedule, env_restarts)
     learnt, wrappers = begun_with(reward, choice.id, wrappers, found.wrappers)
     request = full_request(
-        algorithm, choice, found, wrappers, settings, steps, num_envs, seeds, seed, checkpoint_every, actors, data, started, learnt
-    )
+        algorithm, choice, found, wrappers, settings, steps, num_envs, seeds, seed, checkpoint_every, actors, data, started, learnt,
+        keep_checkpoints,
+    )  # fmt: skip
     if data is None:
         prepare_devices(choice, seeds, devices)
     backend = startup.choose_device(device, is_large(algorithm, choice))
@@ -168,7 +171,9 @@ def runs(output: str | Path = "runs") -> list[Path]:
     return sorted((path.parent for path in Path(output).glob("*/*/*/run.json")), key=lambda path: path.name)
 
 
-def _check_numbers(seed: int, seeds: int, num_envs: int | None) -> None:
+def _check_numbers(seed: int, seeds: int, num_envs: int | None, keep_checkpoints: int) -> None:
+    if keep_checkpoints < KEPT:
+        raise UserError(f"the {KEPT} newest checkpoints always stay; got keep_checkpoints={keep_checkpoints}")
     if max(seeds, num_envs or 1) > _MOST:
         raise UserError(f"at most {_MOST:,} seeds and environments each; got seeds={seeds}, num_envs={num_envs}")
     if not 0 <= seed < 2**32 or seeds < 1:
@@ -215,7 +220,9 @@ def _conduct(run: Path, record: Json, job: Job, progress: bool, begin: Callable[
     compiled_before = job.runner.compile_seconds(), job.runner.compile_wall_seconds()
     per_iteration = job.runner.steps_per_iteration
     keeping = Keeping(
-        save=lambda carry, progressed: save_checkpoint(run, carry, job.source, progressed, per_iteration, as_json(job.request)),
+        save=lambda carry, progressed: save_checkpoint(
+            run, carry, job.source, progressed, per_iteration, as_json(job.request), job.request.keep_checkpoints
+        ),
         export=lambda carry, points: export_policy(run, record, job, carry, points),
     )
     try:

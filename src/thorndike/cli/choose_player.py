@@ -5,16 +5,18 @@ from pathlib import Path
 
 from thorndike.cli.find_run import exists, find_run
 from thorndike.errors import UserError
-from thorndike.games.player_names import check_player, is_run, known_players, suggestion
+from thorndike.games.player_names import check_player, is_run, known_players, split_checkpoint, suggestion
 from thorndike.games.registry import FOR_ONE, can_be_searched, game, game_ids
 from thorndike.records import from_policy, read_policy_facts
 from thorndike.suggestions import did_you_mean
+from thorndike.training.run_directory import checkpoint_of
 from thorndike.training.run_listing import all_runs, read_facts
 from thorndike.user_code import lasting_name
 
 GAME_HELP = "a game: connect_four, othello, go_9x9, chess, ...; or yours, path/to/file.py:NAME"
 PLAYER_HELP = (
-    "random, mcts, mcts:simulations=400, trained, gnugo:level=3, rhino:level=3, gnubg, stockfish:elo=1500, fairy:skill=-10, or a run"
+    "random, mcts, mcts:simulations=400, trained, gnugo:level=3, rhino:level=3, gnubg, stockfish:elo=1500, fairy:skill=-10, "
+    "a run, or a checkpoint of one, RUN@STEP"
 )
 
 
@@ -34,19 +36,20 @@ def check_game(name: str, alone: bool) -> bool:
 
 
 def choose_player(text: str, game_name: str, output: Path) -> str | Path:
-    """A short name that can play, or the directory of the run meant. Raises UserError for anything else."""
+    """A short name that can play, or the directory of the run meant, ``@STEP`` behind it. Raises UserError for anything else."""
     if not is_run(text):
         check_player(text, game_name, can_be_searched(game_name))
         return text
-    if not exists(Path(text)) and text != "latest":
+    wanted, step = split_checkpoint(text)
+    if not exists(Path(wanted)) and wanted != "latest":
         runs = all_runs(output)
-        if not any(text in str(run.relative_to(output)) for run in runs):
+        if not any(wanted in str(run.relative_to(output)) for run in runs):
             close = suggestion(text, [run.name for run in runs])
             known = f"; did you mean '{close}'?" if close else f"; known: {', '.join(known_players())}, and runs in {output}/"
             raise UserError(f"there is no player '{text}'{known}")
-    directory = find_run(text, output)
+    directory = find_run(wanted, output)
     from_policy(directory, read_policy_facts)
     trained_on = read_facts(directory).get("environment")
     if trained_on != lasting_name(game_name):
         raise UserError(f"{directory} was trained on {trained_on}, not on {game_name}")
-    return directory
+    return directory if step is None else Path(f"{directory}@{checkpoint_of(directory, step).name}")

@@ -101,7 +101,8 @@ class TerminalGame:
         if self._warming.is_alive():
             self._warming.join()
         began = time.monotonic()
-        choice = player.choose(Turn(self._game, self._now.position, tuple(self._actions)))
+        earlier = tuple(ply.position for ply in self._plies[:-1])
+        choice = player.choose(Turn(self._game, self._now.position, tuple(self._actions), earlier))
         self._slowest = max(self._slowest, time.monotonic() - began)
         return choice
 

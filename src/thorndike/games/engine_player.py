@@ -1,7 +1,7 @@
 """A program of somebody else's as a player: what it is asked, what becomes of its answers, and of its crashes.
 
 A program that ends or hangs is started once more and told the moves so far; the second time it is given up. An answer that is no legal move
-forfeits the game.
+forfeits the game. One that is stopped is ended, for few programs listen while they think, and started again when it is next asked.
 """
 
 import contextlib
@@ -12,7 +12,7 @@ import numpy as np
 
 from thorndike.errors import UserError
 from thorndike.games.engine_process import EngineFailure, EngineProcess
-from thorndike.games.game import Choice, Player, Turn, named_action
+from thorndike.games.game import Choice, Player, Stopped, Turn, named_action
 
 
 class Answered(NamedTuple):
@@ -49,7 +49,11 @@ def engine_player(name: str, start: Start, asked_always: bool = False) -> Player
     def answer(turn: Turn) -> Answered:
         if not running:
             running.append(start())
-        return running[0].ask(turn)
+        try:
+            return running[0].ask(turn)
+        except Stopped:
+            close()
+            raise
 
     def choose(turn: Turn) -> Choice:
         legal = np.flatnonzero(np.asarray(turn.game.legal(turn.position)))

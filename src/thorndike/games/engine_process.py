@@ -7,10 +7,13 @@ import signal
 import subprocess
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+
+from thorndike.games.game import Stopped
 
 _GRACE_S = 1.0
 """Between asking a program to leave and ending it."""
+_LOOK_EVERY_S = 0.1
 _LONGEST_LINE = 100_000
 _WAITING_LINES = 1000
 
@@ -32,6 +35,8 @@ class EngineProcess:
             raise EngineFailure(f"cannot be started: {error.strerror}") from error
         self._lines: queue.Queue[str | None] = queue.Queue(_WAITING_LINES)
         self._ended = False
+        self.stopped: Callable[[], bool] = lambda: False
+        """Asked while an answer is waited for."""
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
 
@@ -53,17 +58,24 @@ class EngineProcess:
             raise EngineFailure("ended unexpectedly") from error
 
     def line(self, until: float) -> str:
-        """The next line, by ``time.monotonic()`` ``until``. Raises ``EngineFailure`` if there is none."""
+        """The next line, by ``time.monotonic()`` ``until``. Raises ``EngineFailure`` if there is none, ``Stopped`` if none is wanted."""
         if self._ended:
             raise EngineFailure("ended unexpectedly")
-        try:
-            found = self._lines.get(timeout=max(until - time.monotonic(), 0))
-        except queue.Empty:
-            raise EngineFailure("did not answer in time") from None
+        found = self._waited_for(until)
         if found is None:
             self._ended = True
             raise EngineFailure("ended unexpectedly")
         return found
+
+    def _waited_for(self, until: float) -> str | None:
+        while not self.stopped():
+            left = max(until - time.monotonic(), 0)
+            try:
+                return self._lines.get(timeout=min(left, _LOOK_EVERY_S))
+            except queue.Empty:
+                if left <= _LOOK_EVERY_S:
+                    raise EngineFailure("did not answer in time") from None
+        raise Stopped
 
     def close(self, farewell: str = "quit") -> None:
         """Ask it to leave, then make it; afterwards there is no process of it, not even a dead one."""

@@ -26,6 +26,8 @@ _THINKS = {"movetime": (1, 3_600_000), "depth": (1, 100), "nodes": (1, 10**12)}
 _THINKS_BY_DEFAULT = {"movetime": 100}
 _VARIANTS = {"gardner_chess": "gardner", "animal_shogi": "dobutsu"}
 """Our ids -> Fairy-Stockfish's names, where they differ."""
+_SOURCES = {"pachi": "https://github.com/pasky/pachi"}
+"""Of programs that Debian has not; its package pachi is a platform game."""
 _BEYOND_PATH = "/usr/games"
 """Where Debian puts games, which is not on everybody's PATH."""
 
@@ -35,7 +37,7 @@ class Engine(NamedTuple):
 
     program: str
     package: str
-    """Debian's, that it comes in."""
+    """Debian's, that it comes in; empty where it comes in none."""
     games: tuple[str, ...]
     settings: Mapping[str, tuple[int, int]]
     """Name -> least and greatest value."""
@@ -52,6 +54,14 @@ def _gnugo(program: tuple[str, ...], game: str, settings: Settings, limit_s: flo
     command += ["--seed", str(settings["seed"])] if "seed" in settings else []
     # The komi and the way to count of pgx's Go: what is not captured lives, so GNU Go is not to pass before it has cleaned up.
     return gtp_start(tuple(command), int(game.split("x")[-1]), 7.5, limit_s, generate="kgs-genmove_cleanup")
+
+
+def _pachi(program: tuple[str, ...], game: str, settings: Settings, limit_s: float) -> "Start":
+    from thorndike.games.gtp import gtp_start
+
+    command = [*program, "-d", "0", "-r", "chinese", "-t", f"={settings.get('simulations', 2_000)}"]
+    command += ["-s", str(settings["seed"])] if "seed" in settings else []
+    return gtp_start((*command, "threads=1"), int(game.split("x")[-1]), 7.5, limit_s, generate="kgs-genmove_cleanup")
 
 
 def _rhino(program: tuple[str, ...], game: str, settings: Settings, limit_s: float) -> "Start":
@@ -95,6 +105,7 @@ def _limit(settings: Settings) -> Settings:
 ENGINES: Mapping[str, Engine] = MappingProxyType(
     {
         "gnugo": Engine("gnugo", "gnugo", ("go_9x9", "go_19x19"), {"level": (1, 10), "seed": (0, 2**31 - 1)}, _gnugo),
+        "pachi": Engine("pachi", "", ("go_9x9", "go_19x19"), {"simulations": (1, 10**7), "seed": (0, 2**31 - 1)}, _pachi),
         "gnubg": Engine("gnubg", "gnubg", ("backgammon",), {"plies": (0, 4)}, _gnubg, asked_always=True),
         "rhino": Engine("gtp-rhino", "grhino", ("othello",), {"level": (1, 5), "random": (0, 10)}, _rhino),
         "stockfish": Engine("stockfish", "stockfish", ("chess",), {"elo": (1350, 2850), "skill": (0, 20), **_THINKS}, _stockfish),
@@ -154,9 +165,17 @@ def is_engine(text: str) -> bool:
 def program_of(found: Engine) -> str:
     """Where the program is. Raises UserError, with the package to install, where there is none."""
     path = os.pathsep.join([os.environ.get("PATH", os.defpath), _BEYOND_PATH])
+    if not found.package:
+        # Debian's games of that name are others.
+        path = os.pathsep.join(folder for folder in path.split(os.pathsep) if folder != _BEYOND_PATH)
     program = shutil.which(found.program, path=path)
     if program is None:
-        raise UserError(f"{found.program} is not installed; on Debian: apt install {found.package}")
+        how = (
+            f"on Debian: apt install {found.package}"
+            if found.package
+            else f"build it from {_SOURCES[found.program]} (no package of Debian's)"
+        )
+        raise UserError(f"{found.program} is not installed; {how}")
     return program
 
 

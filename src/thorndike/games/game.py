@@ -108,6 +108,14 @@ class Turn(NamedTuple):
     position: Position
     moves: tuple[int, ...]
     """All actions from the beginning."""
+    earlier: tuple[Position, ...] = ()
+    """The positions in which they were played, for players that remember; empty where they were not kept."""
+    stopped: Callable[[], bool] = lambda: False
+    """Whether the answer is wanted no more. A player that takes its time asks now and then, and raises ``Stopped``."""
+
+
+class Stopped(Exception):
+    """A player was told to think no further."""
 
 
 class Player(NamedTuple):

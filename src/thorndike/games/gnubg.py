@@ -64,6 +64,7 @@ def gnubg_start(command: tuple[str, ...], plies: int, move_limit_s: float) -> St
             return found[1], float(chances[1])
 
         def ask(turn: Turn) -> Answered:
+            process.stopped = turn.stopped
             if turn.moves not in planned:
                 if np.asarray(turn.game.legal(turn.position))[0]:
                     return Answered("pass")

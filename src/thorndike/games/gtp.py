@@ -48,6 +48,7 @@ def gtp_start(
             known[:] = turn.moves
 
         def ask(turn: Turn) -> Answered:
+            process.stopped = turn.stopped
             catch_up(turn)
             colour = _COLOURS[int(turn.game.player(turn.position))]
             # It plays its move on its board too, which we take back: the match decides what is played.

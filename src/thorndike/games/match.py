@@ -132,6 +132,7 @@ def play_game(rules: Compiled, players: tuple[Player, Player], number: int, open
     """One game after an opening; ``players`` in the order in which they move. Raises UserError where one of them cannot go on."""
     game, position = rules.game, rules.init(seed)
     moves: list[int] = []
+    earlier: list[Position] = []
     names: list[str] = []
     movers: list[int] = []
     remark, rewards = "", None
@@ -140,7 +141,7 @@ def play_game(rules: Compiled, players: tuple[Player, Player], number: int, open
         if len(moves) < len(opening):
             action = int(opening[len(moves)])
         else:
-            choice = players[mover].choose(Turn(game, position, tuple(moves)))
+            choice = players[mover].choose(Turn(game, position, tuple(moves), tuple(earlier)))
             action, remark = choice.action, choice.remark
             if not choice.resigns and action not in legal:
                 choice = choice._replace(resigns=True)
@@ -150,6 +151,7 @@ def play_game(rules: Compiled, players: tuple[Player, Player], number: int, open
                 break
         names.append(game.action_name(position, action))
         movers.append(mover)
+        earlier.append(position)
         position = rules.step(position, action, seed, len(moves))
         moves.append(action)
     first, second = rewards or rules.rewards(position)

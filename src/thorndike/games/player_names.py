@@ -1,5 +1,6 @@
 """What players are called on a command line, checked before anything heavy is imported."""
 
+import os
 from collections.abc import Iterable
 
 from thorndike.errors import UserError
@@ -19,6 +20,12 @@ def known_players() -> tuple[str, ...]:
 def is_run(text: str) -> bool:
     """Whether a player's name is none of the short ones."""
     return not (text in (RANDOM, TRAINED) or text.partition(":")[0] == MCTS or is_engine(text))
+
+
+def split_checkpoint(text: str) -> tuple[str, str | None]:
+    """Of ``RUN@STEP`` the run and the step; of a run's name, or a directory that is there, None for the step."""
+    run, at, step = text.rpartition("@")
+    return (text, None) if not at or "/" in step or os.path.exists(text) else (run, step)
 
 
 def check_player(text: str, game: str, can_be_searched: bool) -> None:

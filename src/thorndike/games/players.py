@@ -3,8 +3,9 @@
 import jax
 import numpy as np
 
+from thorndike.games.cut_search import cut_search
 from thorndike.games.game import Choice, Game, Player, Turn
-from thorndike.games.search import Found, SearchSettings, by_playouts, search
+from thorndike.games.search import Found, SearchSettings, by_playouts
 
 PLAYOUTS = 100
 """Of ``mcts`` a move, where nobody says otherwise."""
@@ -25,16 +26,13 @@ def mcts_player(game: Game, simulations: int = PLAYOUTS, seed: int = 0) -> Playe
 
     Raises UserError for games of one player, and games with dice, when it is asked.
     """
-    settings = SearchSettings("puct", simulations)
-    evaluate = by_playouts(game)
-    run = jax.jit(lambda position, key: search(game, evaluate, settings, (), position, key, explore=False))
+    look = cut_search(game, by_playouts(game), SearchSettings("puct", simulations))
     base, asked = jax.random.key(seed), 0
 
     def choose(turn: Turn) -> Choice:
         nonlocal asked
         asked += 1
-        found = run(jax.tree.map(lambda leaf: leaf[None], turn.position), jax.random.fold_in(base, asked))
-        return choice_of(found)
+        return choice_of(look((), turn.position, jax.random.fold_in(base, asked), turn.stopped))
 
     return Player(f"mcts:simulations={simulations}", choose)
 

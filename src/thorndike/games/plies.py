@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from thorndike.errors import UserError
 from thorndike.games.game import Board, Game, Position, Square, Turn
 
 
@@ -65,6 +66,18 @@ def line_names(game: Game, ply: Ply, actions: Sequence[int], at_most: int) -> tu
         names.append(game.action_name(ply.position, action))
         ply = next_ply(game, ply, action, seed=0)
     return tuple(names)
+
+
+def positions_before(turn: Turn) -> tuple[Position, ...]:
+    """Those in which the moves so far were played. Raises UserError where they were not kept, and dice were thrown."""
+    if len(turn.earlier) == len(turn.moves):
+        return turn.earlier
+    if turn.game.has_chance:
+        raise UserError(f"a player that remembers is to be told the earlier positions of {turn.game.id}: give Turn.earlier")
+    key, found = jax.random.key(0), [turn.game.init(jax.random.key(0))]
+    for action in turn.moves:
+        found.append(jax.jit(turn.game.step)(found[-1], jnp.int32(action), key))
+    return tuple(found[:-1])
 
 
 class MoveNames:

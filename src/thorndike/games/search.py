@@ -86,13 +86,20 @@ def search(
 
     Raises ``UserError`` for games of one player, and games with dice.
     """
+    key_root, key_search = jax.random.split(key)
+    root, legal = rooted(game, evaluate, params, positions, key_root)
+    return grow(settings, params, root, following(game, evaluate), legal, key_search, explore)
+
+
+def rooted(
+    game: Game, evaluate: Evaluate, params: PyTree, positions: Position, key: Key[Array, ""]
+) -> tuple[mctx.RootFnOutput, Bool[Array, "B actions"]]:
+    """What a search of positions ``[B]`` begins with, and their legal moves. Consumes the key. Raises ``UserError`` as ``search`` does."""
     if not game.can_be_searched:
         raise UserError(f"the search is for two players without dice, which {game.id} is not")
-    key_root, key_search = jax.random.split(key)
-    logits, value = evaluate(params, positions, key_root)
+    logits, value = evaluate(params, positions, key)
     legal = jax.vmap(game.legal)(positions)
-    root = mctx.RootFnOutput(prior_logits=jnp.where(legal, logits, FORBIDDEN), value=value, embedding=positions)
-    return grow(settings, params, root, _recurrent(game, evaluate), legal, key_search, explore)
+    return mctx.RootFnOutput(prior_logits=jnp.where(legal, logits, FORBIDDEN), value=value, embedding=positions), legal
 
 
 def grow(
@@ -103,15 +110,19 @@ def grow(
     legal: Bool[Array, "B actions"],
     key: Key[Array, ""],
     explore: bool,
+    run: Callable[[Simulations], mctx.LoopFn] = lambda simulations: simulations,
 ) -> Found:
-    """Search from ``root``, whatever it is that ``recurrent`` follows: rules, or what a network thinks of them. Consumes the key."""
+    """Search from ``root``, whatever it is that ``recurrent`` follows: rules, or what a network thinks of them. Consumes the key.
+
+    ``run`` may make another loop of the simulations.
+    """
     shared = (params, key, root, recurrent, settings.simulations, ~legal)
     if settings.kind == "puct":
         scaled = mctx.qtransform_by_parent_and_siblings if settings.rescale_values else _scaled_to_unit
         select = partial(mctx.muzero_action_selection, pb_c_init=settings.c_puct, qtransform=scaled)
         output = mctx.muzero_policy(
             *shared,
-            loop_fn=Simulations(params, recurrent, select, select),
+            loop_fn=run(Simulations(params, recurrent, select, select)),
             qtransform=scaled,
             dirichlet_fraction=settings.dirichlet_fraction if explore else 0.0,
             dirichlet_alpha=settings.dirichlet_alpha,
@@ -129,7 +140,7 @@ def grow(
         inside = partial(mctx.gumbel_muzero_interior_action_selection, qtransform=completed)
         output = mctx.gumbel_muzero_policy(
             *shared,
-            loop_fn=Simulations(params, recurrent, at_root, inside),
+            loop_fn=run(Simulations(params, recurrent, at_root, inside)),
             qtransform=completed,
             max_num_considered_actions=considered,
             gumbel_scale=1.0 if explore else 0.0,
@@ -156,7 +167,7 @@ def _line(tree: mctx.Tree, action: Int[Array, ""]) -> Int[Array, " length"]:
     return jax.lax.scan(follow, (jnp.int32(tree.ROOT_INDEX), action), None, length=LONGEST_LINE)[1]
 
 
-def _recurrent(game: Game, evaluate: Evaluate) -> mctx.RecurrentFn:
+def following(game: Game, evaluate: Evaluate) -> mctx.RecurrentFn:
     """One move in the tree of each position."""
 
     def step_one(position: Position, action: Int[Array, ""], key: Key[Array, ""]) -> tuple[Position, Array, Array, Bool[Array, ""], Array]:

@@ -1,7 +1,8 @@
 """A game on a table: who sits there, what was played, which position is looked at. All that a page does with a game, without a page.
 
 Every method may be called from any thread. Those that cannot do what they are asked raise UserError, one line, and change nothing.
-Players think in threads of their own; what an interrupted one answers in the end is thrown away.
+Players think in threads of their own; one that is interrupted, or whom nobody looks at any more, is told to stop, and what it answers all
+the same is thrown away.
 """
 
 import threading
@@ -9,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 from thorndike.errors import UserError
-from thorndike.games.game import Choice, Game, Square, Turn
+from thorndike.games.game import Choice, Game, Square, Stopped, Turn
 from thorndike.games.plies import Ply, first_ply, next_ply
 from thorndike.games.seats import Seat, leave
 from thorndike.games.squares import begins_a_move, why_not
@@ -76,6 +77,8 @@ class Table:
         self._seats, self._analyst = _seated(game, seats), analyst
         self._lock = threading.RLock()
         self._listeners: list[Callable[[], None]] = []
+        self._left = False
+        """Whether there were listeners, and there are none now."""
         self._task: _Task | None = None
         self._analyse = False
         self._start = first_ply(game, seed)
@@ -108,10 +111,24 @@ class Table:
             )
 
     def listen(self, listener: Callable[[], None]) -> Callable[[], None]:
-        """Have a function called, from any thread, whenever something changes; what is returned ends that."""
+        """Have a function called, from any thread, whenever something changes; what is returned ends that.
+
+        Once the last listener has left nobody thinks until there is another one.
+        """
         with self._lock:
             self._listeners.append(listener)
-        return lambda: self._listeners.remove(listener) if listener in self._listeners else None
+            if self._left:
+                self._left = False
+                self._changed()
+
+        def leave_table() -> None:
+            with self._lock:
+                if listener in self._listeners:
+                    self._listeners.remove(listener)
+                    self._left = not self._listeners
+                    self._changed()
+
+        return leave_table
 
     def begin(self) -> None:
         """Let whoever is to move think, if it is no person."""
@@ -287,6 +304,8 @@ class Table:
             listener()
 
     def _wanted(self) -> _Task | None:
+        if self._left:
+            return None
         if self._outcome() is None and not self._paused:
             seat = self._seats[self._plies[-1].player]
             if seat.player is not None:
@@ -303,9 +322,12 @@ class Table:
             with self._lock:
                 if self._task is not task:
                     return
-                turn = Turn(self.game, self._plies[number].position, task.moves)
+                earlier = tuple(ply.position for ply in self._plies[:number])
+                turn = Turn(self.game, self._plies[number].position, task.moves, earlier, lambda: self._task is not task)
             try:
                 choice = seat.player.choose(turn)
+            except Stopped:
+                return
             except Exception as error:
                 self._give_up(task, f"{seat.name} cannot go on: {error}")
                 if not isinstance(error, UserError):

@@ -40,6 +40,7 @@ def uci_start(
         process = started(command, prepare)
 
         def ask(turn: Turn) -> Answered:
+            process.stopped = turn.stopped
             played = " ".join(name for _, name in names(turn))
             process.send(f"position startpos{' moves ' if played else ''}{played}")
             process.send(go)

@@ -1,7 +1,8 @@
 """Checkpoints: the whole carry of a run, written so that whatever happens the newest complete one can be gone on from.
 
-The two newest are kept. They share no file with each other, so that damage to one never reaches the other: a block of a replay buffer that
-has not changed is shared with the checkpoint *before* the newest, which is removed once the new one is in its place.
+The two newest are kept, or as many as are asked for. These two share no file with each other, so that damage to one never reaches the
+other: a block of a replay buffer that has not changed is shared with the checkpoint *before* the newest, which, unless more are asked for,
+is removed once the new one is in its place.
 """
 
 import json
@@ -10,6 +11,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import NamedTuple, TypeVar, cast
 
+import jax
 from jaxtyping import PyTree
 
 from thorndike.errors import UserError
@@ -21,10 +23,12 @@ from thorndike.training.runner import Runner
 from thorndike.training.sealed_folders import Damaged, NewFolder, SealedFolder, discard
 from thorndike.training.segment import Carry
 from thorndike.training.tree_files import read_tree, write_tree
+from thorndike.types import Algorithm
 
 STATE = "state"
 _PROGRESS = "progress.json"
-_KEPT = 2
+KEPT = 2
+"""Checkpoints, where nobody asks for more."""
 _OURS = re.compile(r"(\d+|partial)(\.old|\.gone|\.damaged)*")
 
 Content = TypeVar("Content")
@@ -46,20 +50,26 @@ START = Progressed(0, 0.0, 0.0)
 
 
 def save_checkpoint(
-    run: Path, carry: Carry, source: PyTree, progressed: Progressed, steps_per_iteration: int, request: Mapping[str, object] | None = None
+    run: Path,
+    carry: Carry,
+    source: PyTree,
+    progressed: Progressed,
+    steps_per_iteration: int,
+    request: Mapping[str, object] | None = None,
+    keep: int = KEPT,
 ) -> None:
     """Write the whole carry (of a host source, only what can be restored), what was requested of the run, and where it stands.
 
-    Raises ``OSError`` if it cannot be written; the checkpoints there are stay as they are.
+    The ``keep`` newest checkpoints stay. Raises ``OSError`` if it cannot be written; the checkpoints there are stay as they are.
     """
     folder = run / "checkpoints"
     folder.mkdir(exist_ok=True)
     known = checkpoints(run)
     new = NewFolder(folder / "partial")
-    write_tree(restorable(carry, source), new, STATE, blocks=True, donor=known[-_KEPT] if len(known) >= _KEPT else None)
+    write_tree(restorable(carry, source), new, STATE, blocks=True, donor=known[-KEPT] if len(known) >= KEPT else None)
     new.write(_PROGRESS, as_bytes({**progressed._asdict(), "request": dict(request or {})}))
     new.publish(folder / str(progressed.iteration * steps_per_iteration))
-    kept = checkpoints(run)[-_KEPT:]
+    kept = checkpoints(run)[-keep:]
     for path in folder.iterdir():
         if path not in kept and _OURS.fullmatch(path.name):
             discard(path)
@@ -124,6 +134,38 @@ def _read_progress(folder: SealedFolder) -> tuple[Progressed, Json]:
     check_fields({"request": made_for}, {"request": OBJECT}, where)
     progressed = Progressed(cast(int, content["iteration"]), cast(float, content["wall_s"]), cast(float, content["cpu_s"]))
     return progressed, cast(Json, made_for)
+
+
+def read_actors(
+    folder: Path, algorithm: Algorithm, statistics: Mapping[int, PyTree], seeds: int, compiled: bool
+) -> tuple[PyTree, tuple[PyTree, ...]]:
+    """Actors ``[S, ...]`` of a checkpoint and the statistics of its wrappers. Replay and other large arrays that do not act are not read.
+
+    ``statistics`` are the shapes of one seed's, by the wrapper's place in the chain. Raises ``UserError``.
+    """
+    shapes, structure = jax.tree.flatten(jax.eval_shape(algorithm.init, jax.random.key(0)))
+    acts = _looked_at(algorithm.actor, jax.tree.unflatten(structure, shapes))
+    part = jax.tree.unflatten(structure, [_of_seeds(leaf, seeds) if used else None for leaf, used in zip(shapes, acts, strict=True)])
+    held = {str(place): jax.tree.map(lambda leaf: _of_seeds(leaf, seeds), tree) for place, tree in statistics.items()}
+    learner, learnt = read_tree((part, {"statistics": held} if compiled else held), SealedFolder(folder), STATE, part=True)
+
+    def actor(part: PyTree) -> PyTree:
+        leaves = zip(shapes, jax.tree.leaves(part, is_leaf=lambda leaf: leaf is None), strict=True)
+        return algorithm.actor(jax.tree.unflatten(structure, [shape if leaf is None else leaf for shape, leaf in leaves]))
+
+    found = learnt["statistics"] if compiled else learnt
+    return jax.vmap(actor)(learner), tuple(found[str(place)] for place in statistics)
+
+
+def _looked_at(function: Callable[[PyTree], PyTree], tree: PyTree) -> list[bool]:
+    """Of each leaf of the argument: whether the result depends on it."""
+    traced = jax.make_jaxpr(function)(tree).jaxpr
+    used = {id(each) for equation in traced.eqns for each in equation.invars} | {id(each) for each in traced.outvars}
+    return [id(each) in used for each in traced.invars]
+
+
+def _of_seeds(leaf: jax.ShapeDtypeStruct, seeds: int) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct((seeds, *leaf.shape), leaf.dtype)
 
 
 def restorable(carry: Carry, source: PyTree) -> tuple[PyTree, PyTree]:

@@ -100,6 +100,15 @@ def checkpoints(run: Path) -> list[Path]:
     return sorted(found, key=lambda path: int(path.name))
 
 
+def checkpoint_of(run: Path, step: str | int) -> Path:
+    """The checkpoint of a run at a step. Raises ``UserError``, with the steps there are, if there is none."""
+    known = {path.name: path for path in checkpoints(run)}
+    if str(step) not in known:
+        there = f"it has those of {', '.join(known)}" if known else "it has none"
+        raise UserError(f"{run} has no checkpoint of step {step}: {there}")
+    return known[str(step)]
+
+
 def facts() -> dict[str, object]:
     """Versions, machine and commit: what one needs to know to make the run again."""
     versions = {"python": platform.python_version()}

@@ -6,6 +6,7 @@ has, is not written again.
 """
 
 import math
+from collections.abc import Container
 from pathlib import Path
 
 import jax
@@ -46,30 +47,32 @@ def save_tree(tree: PyTree, path: Path) -> None:
     path.write_bytes(save(named_arrays(tree)))
 
 
-def read_tree(like: PyTree, folder: SealedFolder, name: str) -> PyTree:
+def read_tree(like: PyTree, folder: SealedFolder, name: str, *, part: bool = False) -> PyTree:
     """Read a tree of the structure of ``like`` (arrays or shapes).
 
-    Raises ``Damaged`` where the files are not what was written, ``UserError`` if they hold other names, shapes or dtypes.
+    With ``part`` there may be other arrays too; those that are cut into blocks are then not read. Raises ``Damaged`` where the files are
+    not what was written, ``UserError`` if they hold other names, shapes or dtypes.
     """
-    stored = read_arrays(folder, name)
+    wanted = dict(_named(like))
+    stored = read_arrays(folder, name, wanted if part else None)
     leaves = []
-    for key, leaf in _named(like):
+    for key, leaf in wanted.items():
         if key not in stored:
             raise UserError(f"{folder.path} has no array {key!r}: it was written by another algorithm, network or version")
         leaves.append(_as_leaf(stored.pop(key), leaf, f"{folder.path}: {key!r}"))
-    for key in stored:
+    for key in () if part else stored:
         raise UserError(f"{folder.path} has an array {key[:80]!r} too many: it was written by another algorithm, network or version")
     return jax.tree.unflatten(jax.tree.structure(like), leaves)
 
 
-def read_arrays(folder: SealedFolder, name: str) -> dict[str, np.ndarray]:
-    """Every array of a tree by its path. Raises ``Damaged``."""
+def read_arrays(folder: SealedFolder, name: str, wanted: Container[str] | None = None) -> dict[str, np.ndarray]:
+    """Every array of a tree by its path; of those in blocks only the ``wanted`` ones. Raises ``Damaged``."""
     try:
         views = deserialize(folder.read(f"{name}.safetensors"))
         arrays = {key: _array(view["data"], view["dtype"], view["shape"]) for key, view in views}
         if f"{name}.blocks.json" in folder:
             described = parse_object(folder.read(f"{name}.blocks.json"), folder.path)
-            arrays |= {key: _read_blocks(facts, folder) for key, facts in described.items()}
+            arrays |= {key: _read_blocks(facts, folder) for key, facts in described.items() if wanted is None or key in wanted}
     except Damaged:
         raise
     except (SafetensorError, ValueError, KeyError, TypeError, MemoryError) as error:

@@ -1,6 +1,6 @@
 """Whom one can play against, by game."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
@@ -10,6 +10,7 @@ from thorndike.games.game import Game, Player
 from thorndike.games.registry import FOR_ONE, can_be_searched
 from thorndike.games.registry import game as find_game
 from thorndike.games.trained import trained_run
+from thorndike.training.run_directory import checkpoints
 from thorndike.training.run_listing import all_runs, read_facts
 from thorndike.user_code import lasting_name
 
@@ -38,7 +39,14 @@ ANOTHER_PERSON = Opponent(PERSON, "Another person, here", None)
 ALONE = Opponent(PERSON, "Nobody: one plays alone", None)
 _LONG = ("chess", "shogi", "go_19x19")
 """Games that take a search minutes to play out at random as often as it must."""
-_ENGINE_NAMES = {"gnugo": "GNU Go", "gnubg": "GNU Backgammon", "rhino": "grhino", "stockfish": "Stockfish", "fairy": "Fairy-Stockfish"}
+_ENGINE_NAMES = {
+    "gnugo": "GNU Go",
+    "pachi": "Pachi",
+    "gnubg": "GNU Backgammon",
+    "rhino": "grhino",
+    "stockfish": "Stockfish",
+    "fairy": "Fairy-Stockfish",
+}
 
 
 def is_for_one(game_id: str) -> bool:
@@ -54,9 +62,10 @@ def opponents_in(output: Path) -> Opponents:
             return ()
         searched = can_be_searched(game_id)
         found = [
-            _named(str(run), f"{run.parent.name}, {run.name}", searched, before="Trained: ")
+            _named(who, name, searched, before="Trained: ")
             for run in reversed(all_runs(output))
             if _trained_on(run, game_id)
+            for who, name in _agents(run)
         ]
         if (shipped := trained_run(game_id)) is not None:
             found.append(_named(str(shipped), "Thorndike's own", searched, before="Trained: "))
@@ -77,6 +86,14 @@ def _named(who: str, name: str, searches: bool = False, before: str = "", after:
         return player(who, game, simulations=simulations)._replace(name=name)
 
     return Opponent(who, before + name + after, make, searches)
+
+
+def _agents(run: Path) -> Iterator[tuple[str, str]]:
+    """The run's policy, and its checkpoints before the newest, whose policy that is."""
+    name = f"{run.parent.name}, {run.name}"
+    yield str(run), name
+    for checkpoint in reversed(checkpoints(run)[:-1]):
+        yield f"{run}@{checkpoint.name}", f"{name}, at step {int(checkpoint.name):,}"
 
 
 def _trained_on(run: Path, game_id: str) -> bool:
