@@ -6,6 +6,7 @@ import numpy as np
 
 from thorndike.games.face import Face
 from thorndike.games.game import Board, Position, Square
+from thorndike.games.go_view import seen_by_mover
 from thorndike.games.turning import turned_board
 
 _LETTERS = "abcdefghijklmnopqrstuvwxyz"
@@ -45,5 +46,5 @@ def _stones(position: Position, kind: str) -> np.ndarray:
 
 
 HEX = _placing(11, "hex", "swap", _HEX)
-GO_9X9 = _placing(9, "go", "pass", _ALL)
-GO_19X19 = _placing(19, "go", "pass", _ALL)
+GO_9X9 = _placing(9, "go", "pass", _ALL)._replace(observe=seen_by_mover)
+GO_19X19 = _placing(19, "go", "pass", _ALL)._replace(observe=seen_by_mover)

@@ -16,7 +16,7 @@ from thorndike.networks.dense import dense
 from thorndike.networks.hidden_layers import SHOWN, hidden_layers
 from thorndike.networks.network import Network
 
-TOWERS = ("mlp", "patches", "conv")
+TOWERS = ("mlp", "patches", "conv", "squares")
 
 _hidden_init = nn.initializers.he_normal()
 _small_init = nn.initializers.variance_scaling(0.01, "fan_in", "normal")
@@ -36,6 +36,8 @@ class BoardNetwork(nn.Module):
     @nn.compact
     def __call__(self, board: Float[Array, "B H W C"]) -> tuple[Float[Array, "B actions"], Float[Array, " B"]]:
         """Board to a policy and a value."""
+        if self.tower == "squares":
+            return self._by_squares(board)
         x = self._convolutions(board) if self.tower == "conv" else self._dense_layers(board)
         value = self._shown(dense(64, _hidden_init, name="value_hidden")(x))
         return dense(self.actions, _small_init, name="policy")(x), dense(1, _small_init, name="value")(value)[..., 0]
@@ -66,6 +68,29 @@ class BoardNetwork(nn.Module):
             inner = self._shown(convolution(f"block_{block}_a", _hidden_init)(self._shown(x)))
             x = x + convolution(f"block_{block}_b", _small_init)(inner)
         return self._shown(dense(self.width, _hidden_init, name="last")(self._shown(x).reshape((board.shape[0], -1))))
+
+    def _by_squares(self, board: Float[Array, "B H W C"]) -> tuple[Float[Array, "B actions"], Float[Array, " B"]]:
+        """Convolutions, then each square's moves by the same weights; what is left of the moves, and the value, by the whole board."""
+
+        def convolution(name: str, init: Callable[..., Array], channels: int = self.width, size: int = 3) -> Convolution:
+            return Convolution(channels, size, 1, init, same=True, name=name)
+
+        x = convolution("first", _hidden_init)(board)
+        for block in range(self.blocks):
+            inner = convolution(f"block_{block}_a", _hidden_init)(self._shown(x))
+            # What is true of the whole board is told to every square, as KataGo does.
+            whole = dense(self.width, _small_init, name=f"block_{block}_whole")(self._pooled(inner))
+            x = x + convolution(f"block_{block}_b", _small_init)(self._shown(inner + whole[:, None, None]))
+        x = self._shown(x)
+        value = self._shown(dense(64, _hidden_init, name="value_hidden")(self._pooled(x)))
+        a_square, others = divmod(self.actions, board.shape[1] * board.shape[2])
+        policy = convolution("policy", _small_init, a_square, 1)(x).reshape((board.shape[0], -1))
+        if others:
+            policy = jnp.concatenate([policy, dense(others, _small_init, name="policy_others")(value)], axis=-1)
+        return policy, dense(1, _small_init, name="value")(value)[..., 0]
+
+    def _pooled(self, x: Float[Array, "B H W C"]) -> Float[Array, "B 2*C"]:
+        return jnp.concatenate([jnp.mean(x, axis=(1, 2)), jnp.max(x, axis=(1, 2))], axis=-1)
 
 
 def board_network(actions: int, tower: str, width: int, blocks: int) -> Network:
