@@ -80,7 +80,7 @@ class Config:
     weight_decay: Annotated[float, AtLeast(0)] = 1e-4  # c: of AdamW, decoupled
     max_grad_norm: Annotated[float, MoreThan(0)] = 1.0  # global norm the gradient is clipped to
     averaging: Annotated[float, MoreThan(0), Between(0, 1)] = 0.005  # how far what plays moves to the newest parameters at a step
-    tower: Annotated[str, OneOf(*TOWERS)] = "mlp"  # dense layers, dense layers on shared patches, or convolutions
+    tower: Annotated[str, OneOf(*TOWERS)] = "mlp"  # dense layers, these on shared patches, convolutions, or these with moves by square
     width: Annotated[int, AtLeast(1)] = 256  # units of a dense layer, or channels
     blocks: Annotated[int, AtLeast(0)] = 2  # residual blocks of two layers
 

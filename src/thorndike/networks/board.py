@@ -2,6 +2,8 @@
 
 On a CPU dense layers give some ten times the positions a second of a convolution tower of the same use on a small board; ``patches`` first
 looks at every square block of the board with the same weights, as a convolution does, which a line of pieces looks alike in everywhere.
+``squares`` is for games whose moves are numbered square by square as the board is shown (Go, and chess here): convolutions, told what is
+true of the whole board, and every square says by the same weights what its moves are worth.
 """
 
 from collections.abc import Callable
@@ -84,10 +86,9 @@ class BoardNetwork(nn.Module):
         x = self._shown(x)
         value = self._shown(dense(64, _hidden_init, name="value_hidden")(self._pooled(x)))
         a_square, others = divmod(self.actions, board.shape[1] * board.shape[2])
-        policy = convolution("policy", _small_init, a_square, 1)(x).reshape((board.shape[0], -1))
-        if others:
-            policy = jnp.concatenate([policy, dense(others, _small_init, name="policy_others")(value)], axis=-1)
-        return policy, dense(1, _small_init, name="value")(value)[..., 0]
+        policy = [convolution("policy", _small_init, a_square, 1)(x).reshape((board.shape[0], -1))] if a_square else []
+        policy += [dense(others, _small_init, name="policy_others")(value)] if others else []
+        return jnp.concatenate(policy, axis=-1), dense(1, _small_init, name="value")(value)[..., 0]
 
     def _pooled(self, x: Float[Array, "B H W C"]) -> Float[Array, "B 2*C"]:
         return jnp.concatenate([jnp.mean(x, axis=(1, 2)), jnp.max(x, axis=(1, 2))], axis=-1)
