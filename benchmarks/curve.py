@@ -4,8 +4,8 @@ python benchmarks/curve.py go_9x9 --budget 600    into benchmarks/results/curve.
 
 The settings are the preset's. CPU-seconds are those of playing and learning on one core, compiling left out. Checkpoints and finished
 matches are kept in a folder (--keep): with the same folder the command goes on where it was, and does not train again what was trained.
-Everybody plays everybody, from random openings that are played twice with colours swapped; ratings are fitted to all games at once, and the
-random player's is set to 0.
+A checkpoint plays the next one and all others, the last one the first; openings are random, and played twice with colours swapped. Ratings
+are fitted to all games at once, and the random player's is set to 0.
 """
 
 import argparse
@@ -38,8 +38,8 @@ ROOT = Path(__file__).parents[1]
 RESULT = ROOT / "benchmarks" / "results" / "curve.json"
 CHECKPOINTS = (0.0, 0.125, 0.25, 0.5, 1.0)
 """Shares of the budget."""
-SIMULATIONS, AT_A_TIME = 32, 4
-"""Of a checkpoint's move in a match; iterations of learning between two looks at the clock."""
+AT_A_TIME = 4
+"""Iterations of learning between two looks at the clock."""
 
 
 class Plan(NamedTuple):
@@ -47,13 +47,15 @@ class Plan(NamedTuple):
 
     opponents: tuple[str, ...]
     """Random moves first."""
-    opening_plies: int
+    simulations: int
+    """Of a checkpoint's move."""
+    opening_plies: int = 4
 
 
 PLANS = {
-    "go_9x9": Plan(("random", "mcts:8", "gnugo:level=1"), 4),
-    "chess": Plan(("random", "fairy:skill=-20,depth=1", "stockfish:skill=0,depth=1"), 4),
-    "gardner_chess": Plan(("random", "fairy:skill=-20,depth=1"), 4),
+    "go_9x9": Plan(("random", "mcts:8", "gnugo:level=1"), 32),
+    "chess": Plan(("random", "fairy:skill=-20,depth=1", "stockfish:skill=0,depth=1"), 16),
+    "gardner_chess": Plan(("random", "fairy:skill=-20,depth=1"), 32),
 }
 
 
@@ -65,10 +67,10 @@ class Checkpoint(NamedTuple):
     actor: PyTree
 
 
-def learner(rules: Game, preset: Preset) -> tuple[Algorithm, Environment]:
-    """The preset's algorithm, which searches ``SIMULATIONS`` positions for a move of a match, and its games."""
+def learner(rules: Game, preset: Preset, simulations: int) -> tuple[Algorithm, Environment]:
+    """The preset's algorithm, which searches so many positions for a move of a match, and its games."""
     environment = game_environment(rules, preset.num_envs, game_settings(rules.id, preset.env_kwargs))
-    config = Config(**{**preset.settings, "total_steps": preset.steps, "eval_simulations": SIMULATIONS})
+    config = Config(**{**preset.settings, "total_steps": preset.steps, "eval_simulations": simulations})
     return alphazero(config, environment.spec), environment
 
 
@@ -123,21 +125,27 @@ def sides(rules: Game, plan: Plan, algorithm: Algorithm, kept: list[Checkpoint],
     return found
 
 
+def pairs(players: int, others: int) -> list[tuple[int, int]]:
+    """Who plays whom: the last ``others`` everybody, the checkpoints before them their neighbours, and the last the first."""
+    own = players - others
+    met = [(first, second) for first in range(players) for second in range(max(first + 1, own), players)]
+    return [*((first, first + 1) for first in range(own - 1)), *([(0, own - 1)] if own > 2 else []), *met]
+
+
 def matches(rules: Game, plan: Plan, pool: list[Side], games: int, seed: int, folder: Path) -> list[dict]:
     """A row a pair: games won, drawn and lost by the first of it, of those that it began, and of those that the second began."""
     told = folder / "matches.jsonl"
     rows = [json.loads(line) for line in told.read_text(encoding="utf-8").splitlines()] if told.exists() else []
-    for first in range(len(pool)):
-        for second in range(first + 1, len(pool)):
-            pair = {"players": [pool[first].name, pool[second].name], "games": games, "seed": seed}
-            if any(pair.items() <= row.items() for row in rows):
-                continue
-            scores = play(rules, pool[first], pool[second], games, plan.opening_plies, seed).scores
-            began = [[part.count(value) for value in (1.0, 0.5, 0.0)] for part in (scores[0::2], scores[1::2])]
-            rows.append({**pair, "first_begins": began[0], "second_begins": began[1]})
-            with told.open("a", encoding="utf-8") as lines:
-                lines.write(json.dumps(rows[-1]) + "\n")
-            print(rows[-1], flush=True)
+    for first, second in pairs(len(pool), len(plan.opponents)):
+        pair = {"players": [pool[first].name, pool[second].name], "games": games, "seed": seed}
+        if any(pair.items() <= row.items() for row in rows):
+            continue
+        scores = play(rules, pool[first], pool[second], games, plan.opening_plies, seed).scores
+        began = [[part.count(value) for value in (1.0, 0.5, 0.0)] for part in (scores[0::2], scores[1::2])]
+        rows.append({**pair, "first_begins": began[0], "second_begins": began[1]})
+        with told.open("a", encoding="utf-8") as lines:
+            lines.write(json.dumps(rows[-1]) + "\n")
+        print(rows[-1], flush=True)
     names = [side.name for side in pool]
     return [row for row in rows if row["games"] == games and row["seed"] == seed and set(row["players"]) <= set(names)]
 
@@ -171,7 +179,7 @@ def draw(name: str, row: dict) -> None:
         points = row["checkpoints"]
         elo = np.array([p["elo"] for p in points], float)
         around = np.abs(np.array([p["ci95"] for p in points], float).T - elo)
-        label = f"alphazero, {SIMULATIONS} simulations a move"
+        label = f"alphazero, {row['simulations']} simulations a move"
         axes.errorbar([p["cpu_s"] for p in points], elo, yerr=around, fmt="o-", capsize=3, color=COLOURS[0], label=label)
         for colour, other in zip(COLOURS[1:], row["others"], strict=False):
             axes.axhline(other["elo"], color=colour, linestyle="--", label=other["player"])
@@ -194,7 +202,7 @@ def main() -> None:
     folder = options.keep or Path("runs") / "curve" / name
     folder.mkdir(parents=True, exist_ok=True)
     rules, preset = game(name), find_preset("alphazero", name)
-    algorithm, environment = learner(rules, preset)
+    algorithm, environment = learner(rules, preset, plan.simulations)
     if not (folder / "training.json").exists():
         train(algorithm, environment, options.budget, options.seed, folder)
     kept = checkpoints(algorithm, folder)
@@ -207,7 +215,7 @@ def main() -> None:
     trained = json.loads((folder / "training.json").read_text(encoding="utf-8"))
     told = {key: value for key, value in trained.items() if key != "checkpoints"}
     command = f"python benchmarks/curve.py {name} --budget {trained['budget_cpu_s']:g} --games {options.games} --seed {options.seed}"
-    told |= {"command": command, "games_a_pair": options.games, "opening_plies": plan.opening_plies, "simulations": SIMULATIONS}
+    told |= {"command": command, "games_a_pair": options.games, "opening_plies": plan.opening_plies, "simulations": plan.simulations}
     told |= {"num_envs": preset.num_envs, "settings": {**preset.settings, **preset.env_kwargs, "total_steps": preset.steps}}
     results = json.loads(RESULT.read_text(encoding="utf-8")) if RESULT.exists() else {}
     results[name] = told | rated([side.name for side in pool], kept, rows)
