@@ -1,15 +1,17 @@
-"""A game learnt for a stated time, and how strong its checkpoints are in a pool with random moves, plain tree search and an engine.
+"""A game learnt for a stated time, and how strong its checkpoints are in a pool with random moves, plain tree search and engines.
 
-python benchmarks/curve.py go_9x9 --budget 90    into benchmarks/results/curve.json and docs/images/curve_go_9x9.png
+python benchmarks/curve.py go_9x9 --budget 600    into benchmarks/results/curve.json and docs/images/curve_go_9x9.png
 
-CPU-seconds are those of playing and learning on one core, compiling left out. Everybody plays everybody, from random openings
-that are played twice with colours swapped; ratings are fitted to all games at once, and the random player's is set to 0.
+The settings are the preset's. CPU-seconds are those of playing and learning on one core, compiling left out. Checkpoints and finished
+matches are kept in a folder (--keep): with the same folder the command goes on where it was, and does not train again what was trained.
+A checkpoint plays the next one and all others, the last one the first; openings are random, and played twice with colours swapped. Ratings
+are fitted to all games at once, and the random player's is set to 0.
 """
 
 import argparse
 import json
+import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,47 +19,43 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
+from machine import commit, versions
 from side_by_side import Side, engine_side, mcts_side, play, together
 from thorndike.algorithms.alphazero import Config, alphazero
 from thorndike.environments.wrappers import chain
 from thorndike.games.environment import game_environment, observed_position
 from thorndike.games.game import Game
 from thorndike.games.registry import game
-from thorndike.games.settings import GameSettings
+from thorndike.games.settings import game_settings
 from thorndike.plotting.style import COLOURS, STYLE, save_figure
 from thorndike.statistics.ratings import Games, fit_ratings
+from thorndike.training.presets import Preset, find_preset
 from thorndike.training.runner import runner
 from thorndike.training.sources import compiled_source
-from thorndike.types import Algorithm
+from thorndike.types import Algorithm, Environment
 
 ROOT = Path(__file__).parents[1]
 RESULT = ROOT / "benchmarks" / "results" / "curve.json"
-CHECKPOINTS = (0.0, 0.25, 0.5, 1.0)
+CHECKPOINTS = (0.0, 0.125, 0.25, 0.5, 1.0)
 """Shares of the budget."""
-SHARED = {"num_simulations": 16, "fast_simulations": 6, "full_search_fraction": 0.5, "eval_simulations": 32, "gradient_steps": 8}
-SHARED |= {"n_steps": 8, "batch_size": 256, "learning_rate": "linear(1e-3, 3e-4)", "blocks": 1, "buffer_size": 60_000}
+AT_A_TIME = 4
+"""Iterations of learning between two looks at the clock."""
 
 
 class Plan(NamedTuple):
-    """How a game is learnt, and whom its checkpoints meet."""
+    """Whom a game's checkpoints meet, and how games begin."""
 
-    games: int
-    """Side by side."""
-    settings: dict[str, object]
     opponents: tuple[str, ...]
-    opening_plies: int
-    expected: int
-    """Positions that the budget is about enough for, by which the learning rate falls."""
+    """Random moves first."""
+    simulations: int
+    """Of a checkpoint's move."""
+    opening_plies: int = 4
 
 
 PLANS = {
-    "go_9x9": Plan(
-        64,
-        {**SHARED, "tower": "patches", "width": 128, "learning_starts": 5_000, "temperature_moves": 12},
-        ("random", "mcts:4", "gnugo:level=1"),
-        4,
-        120_000,
-    ),
+    "go_9x9": Plan(("random", "mcts:8", "gnugo:level=1"), 32),
+    "chess": Plan(("random", "fairy:skill=-20,depth=1", "stockfish:skill=0,depth=1"), 16),
+    "gardner_chess": Plan(("random", "fairy:skill=-20,depth=1"), 32),
 }
 
 
@@ -69,40 +67,50 @@ class Checkpoint(NamedTuple):
     actor: PyTree
 
 
-def learnt(rules: Game, plan: Plan, budget: float, seed: int) -> tuple[Algorithm, list[Checkpoint]]:
-    """Train for ``budget`` CPU-seconds; the checkpoints at ``CHECKPOINTS`` of it."""
-    environment = game_environment(rules, plan.games, GameSettings(opening_share=0.5, opening_plies=16))
-    algorithm = alphazero(Config(**plan.settings, total_steps=plan.expected), environment.spec)
+def learner(rules: Game, preset: Preset, simulations: int) -> tuple[Algorithm, Environment]:
+    """The preset's algorithm, which searches so many positions for a move of a match, and its games."""
+    environment = game_environment(rules, preset.num_envs, game_settings(rules.id, preset.env_kwargs))
+    config = Config(**{**preset.settings, "total_steps": preset.steps, "eval_simulations": simulations})
+    return alphazero(config, environment.spec), environment
+
+
+def train(algorithm: Algorithm, environment: Environment, budget: float, seed: int, folder: Path) -> None:
+    """Train for ``budget`` CPU-seconds; the checkpoints at ``CHECKPOINTS`` of it, into ``folder`` as they come."""
     bound = runner(algorithm, compiled_source(environment, algorithm, chain()), seed, range(1))
-    carry, done, spent, kept = bound.init(), 0, 0.0, []
-    due = [share * budget for share in CHECKPOINTS]
-    rounds = iteration_counts(algorithm.needs.warmup_iterations)
+    carry, done, spent, due = bound.init(), 0, 0.0, [share * budget for share in CHECKPOINTS]
+    facts: dict[str, object] = {"budget_cpu_s": budget, "seed": seed, "commit": commit(ROOT), "versions": versions(Path(sys.executable))}
+    points: list[dict[str, float]] = []
     while due:
         if spent >= due[0]:
             actor = jax.tree.map(lambda leaf: np.array(leaf[0]), algorithm.actor(carry.learner))
-            kept.append(Checkpoint(round(spent, 1), done * bound.steps_per_iteration, actor))
-            print(rules.id, kept[-1][:2], flush=True)
+            np.savez(folder / f"{len(points)}.npz", *jax.tree.leaves(actor))
+            points.append({"cpu_s": round(spent, 1), "positions": done * bound.steps_per_iteration})
+            (folder / "training.json").write_text(json.dumps({**facts, "checkpoints": points}), encoding="utf-8")
+            print(points[-1], flush=True)
             due.pop(0)
             continue
         began, compiled = time.process_time(), bound.compile_seconds()
-        count = next(rounds)
+        count = AT_A_TIME if done else max(algorithm.needs.warmup_iterations, 1)
         carry, report = bound.advance(carry, done, count)
         jax.block_until_ready(report)
         done += count
         spent += time.process_time() - began - (bound.compile_seconds() - compiled)
     print({name: round(float(value[0]), 3) for name, value in report.metrics.items()}, flush=True)
-    return algorithm, kept
 
 
-def iteration_counts(warmup: int) -> Iterator[int]:
-    """The warm-up, then a few iterations at a time."""
-    yield max(warmup, 1)
-    while True:
-        yield 4
+def checkpoints(algorithm: Algorithm, folder: Path) -> list[Checkpoint]:
+    """What ``train`` has kept."""
+    structure = jax.tree.structure(jax.eval_shape(lambda key: algorithm.actor(algorithm.init(key)), jax.random.key(0)))
+    found = []
+    for number, point in enumerate(json.loads((folder / "training.json").read_text(encoding="utf-8"))["checkpoints"]):
+        with np.load(folder / f"{number}.npz") as leaves:
+            actor = jax.tree.unflatten(structure, [leaves[name] for name in leaves.files])
+        found.append(Checkpoint(point["cpu_s"], point["positions"], actor))
+    return found
 
 
 def sides(rules: Game, plan: Plan, algorithm: Algorithm, kept: list[Checkpoint], size: int) -> list[Side]:
-    """Checkpoints, weakest first, then the others."""
+    """Checkpoints, the youngest first, then the others."""
     noise = jax.tree.map(lambda x: x[0], algorithm.draw(jax.random.key(0), 1))
     observed = jax.vmap(lambda position: observed_position(rules, position))
     decide = jax.jit(lambda actor, positions: algorithm.greedy(actor, algorithm.memory(size), observed(positions), noise)[1])
@@ -117,32 +125,46 @@ def sides(rules: Game, plan: Plan, algorithm: Algorithm, kept: list[Checkpoint],
     return found
 
 
-def measure(name: str, budget: float, games: int, seed: int) -> dict[str, object]:
-    """Train, play, rate."""
-    rules, plan = game(name), PLANS[name]
-    algorithm, kept = learnt(rules, plan, budget, seed)
-    pool, matches, rows = sides(rules, plan, algorithm, kept, games // 2), [], []
-    for first in range(len(pool)):
-        for second in range(first + 1, len(pool)):
-            scores = play(rules, pool[first], pool[second], games, plan.opening_plies, seed).scores
-            for begins in (0, 1):
-                of = [score if begins == 0 else 1 - score for score in scores[begins::2]]
-                pair = (first, second) if begins == 0 else (second, first)
-                matches.append(Games(*pair, of.count(1.0), of.count(0.5), of.count(0.0)))
-            counts = {"won": scores.count(1.0), "drawn": scores.count(0.5), "lost": scores.count(0.0)}
-            rows.append({"players": [pool[first].name, pool[second].name], **counts})
-            print(rows[-1], flush=True)
-    for side in pool:
-        side.close()
-    rated = fit_ratings(len(pool), matches)
-    zero = rated.players[len(kept)].elo
-    ratings = [
-        {"player": side.name, "elo": round(r.elo - zero), "ci95": [round(r.low - zero), round(r.high - zero)], "score": round(r.score, 3)}
-        for side, r in zip(pool, rated.players, strict=True)
+def pairs(players: int, others: int) -> list[tuple[int, int]]:
+    """Who plays whom: the last ``others`` everybody, the checkpoints before them their neighbours, and the last the first."""
+    own = players - others
+    met = [(first, second) for first in range(players) for second in range(max(first + 1, own), players)]
+    return [*((first, first + 1) for first in range(own - 1)), *([(0, own - 1)] if own > 2 else []), *met]
+
+
+def matches(rules: Game, plan: Plan, pool: list[Side], games: int, seed: int, folder: Path) -> list[dict]:
+    """A row a pair: games won, drawn and lost by the first of it, of those that it began, and of those that the second began."""
+    told = folder / "matches.jsonl"
+    rows = [json.loads(line) for line in told.read_text(encoding="utf-8").splitlines()] if told.exists() else []
+    for first, second in pairs(len(pool), len(plan.opponents)):
+        pair = {"players": [pool[first].name, pool[second].name], "games": games, "seed": seed}
+        if any(pair.items() <= row.items() for row in rows):
+            continue
+        scores = play(rules, pool[first], pool[second], games, plan.opening_plies, seed).scores
+        began = [[part.count(value) for value in (1.0, 0.5, 0.0)] for part in (scores[0::2], scores[1::2])]
+        rows.append({**pair, "first_begins": began[0], "second_begins": began[1]})
+        with told.open("a", encoding="utf-8") as lines:
+            lines.write(json.dumps(rows[-1]) + "\n")
+        print(rows[-1], flush=True)
+    names = [side.name for side in pool]
+    return [row for row in rows if row["games"] == games and row["seed"] == seed and set(row["players"]) <= set(names)]
+
+
+def rated(pool: list[str], kept: list[Checkpoint], rows: list[dict]) -> dict[str, object]:
+    """Ratings of all, random moves at 0."""
+    counts = []
+    for row in rows:
+        first, second = map(pool.index, row["players"])
+        counts.append(Games(first, second, *row["first_begins"]))
+        counts.append(Games(second, first, *reversed(row["second_begins"])))
+    ratings = fit_ratings(len(pool), counts).players
+    zero = ratings[pool.index("random")].elo
+    told = [
+        {"player": name, "elo": round(r.elo - zero), "ci95": [round(r.low - zero), round(r.high - zero)], "score": round(r.score, 3)}
+        for name, r in zip(pool, ratings, strict=True)
     ]
-    checkpoints = [{"cpu_s": each.cpu_s, "positions": each.positions, **rating} for each, rating in zip(kept, ratings, strict=False)]
-    settings = {"budget_cpu_s": budget, "games_a_pair": games, "seed": seed, "num_envs": plan.games, "settings": plan.settings}
-    return {**settings, "checkpoints": checkpoints, "others": ratings[len(kept) :], "matches": rows}
+    points = [{"cpu_s": each.cpu_s, "positions": each.positions, **rating} for each, rating in zip(kept, told, strict=False)]
+    return {"checkpoints": points, "others": told[len(kept) :], "matches": rows}
 
 
 def draw(name: str, row: dict) -> None:
@@ -157,9 +179,8 @@ def draw(name: str, row: dict) -> None:
         points = row["checkpoints"]
         elo = np.array([p["elo"] for p in points], float)
         around = np.abs(np.array([p["ci95"] for p in points], float).T - elo)
-        axes.errorbar(
-            [p["cpu_s"] for p in points], elo, yerr=around, fmt="o-", capsize=3, color=COLOURS[0], label="alphazero, 32 simulations"
-        )
+        label = f"alphazero, {row['simulations']} simulations a move"
+        axes.errorbar([p["cpu_s"] for p in points], elo, yerr=around, fmt="o-", capsize=3, color=COLOURS[0], label=label)
         for colour, other in zip(COLOURS[1:], row["others"], strict=False):
             axes.axhline(other["elo"], color=colour, linestyle="--", label=other["player"])
         axes.set(xlabel="CPU-seconds of training, one core", ylabel="Elo, random moves are 0")
@@ -172,14 +193,34 @@ def draw(name: str, row: dict) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("game", choices=tuple(PLANS))
-    parser.add_argument("--budget", type=float, default=90, help="CPU-seconds of training")
-    parser.add_argument("--games", type=int, default=16, help="of each pair")
+    parser.add_argument("--budget", type=float, default=600, help="CPU-seconds of training")
+    parser.add_argument("--games", type=int, default=40, help="of each pair")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--keep", type=Path, help="folder of checkpoints and matches (default: runs/curve/GAME)")
     options = parser.parse_args()
+    name, plan = options.game, PLANS[options.game]
+    folder = options.keep or Path("runs") / "curve" / name
+    folder.mkdir(parents=True, exist_ok=True)
+    rules, preset = game(name), find_preset("alphazero", name)
+    algorithm, environment = learner(rules, preset, plan.simulations)
+    if not (folder / "training.json").exists():
+        train(algorithm, environment, options.budget, options.seed, folder)
+    kept = checkpoints(algorithm, folder)
+    pool = sides(rules, plan, algorithm, kept, options.games // 2)
+    try:
+        rows = matches(rules, plan, pool, options.games, options.seed, folder)
+    finally:
+        for side in pool:
+            side.close()
+    trained = json.loads((folder / "training.json").read_text(encoding="utf-8"))
+    told = {key: value for key, value in trained.items() if key != "checkpoints"}
+    command = f"python benchmarks/curve.py {name} --budget {trained['budget_cpu_s']:g} --games {options.games} --seed {options.seed}"
+    told |= {"command": command, "games_a_pair": options.games, "opening_plies": plan.opening_plies, "simulations": plan.simulations}
+    told |= {"num_envs": preset.num_envs, "settings": {**preset.settings, **preset.env_kwargs, "total_steps": preset.steps}}
     results = json.loads(RESULT.read_text(encoding="utf-8")) if RESULT.exists() else {}
-    results[options.game] = measure(options.game, options.budget, options.games, options.seed)
+    results[name] = told | rated([side.name for side in pool], kept, rows)
     RESULT.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
-    draw(options.game, results[options.game])
+    draw(name, results[name])
 
 
 if __name__ == "__main__":

@@ -91,7 +91,7 @@ class Config:
     gate_every: Annotated[int, AtLeast(0)] = 0  # iterations between matches that what plays next must win; 0: the average always plays
     gate_games: Annotated[int, AtLeast(2)] = 100  # games of such a match
     gate_threshold: Annotated[float, Between(0, 1)] = 0.55  # share of its points that is needed
-    tower: Annotated[str, OneOf(*TOWERS)] = "mlp"  # dense layers, dense layers on shared patches, or convolutions
+    tower: Annotated[str, OneOf(*TOWERS)] = "mlp"  # dense layers, these on shared patches, convolutions, or these with moves by square
     width: Annotated[int, AtLeast(1)] = 256  # units of a dense layer, or channels
     blocks: Annotated[int, AtLeast(0)] = 2  # residual blocks of two layers
 

@@ -2,7 +2,9 @@
 
 from collections.abc import Sequence
 
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from thorndike.games.face import Face
 from thorndike.games.game import Board, Position, Square
@@ -55,7 +57,30 @@ def _chess(size: int) -> Face:
         ranks = tuple(str(size - i) for i in range(size))
         return Board(tuple(map(tuple, rows)), ranks, tuple(_FILES[:size]), clicks, buttons)
 
-    return Face(board, action_name)
+    return Face(board, action_name, observe=_seen_by_mover)
+
+
+def _seen_by_mover(position: Position) -> Float[Array, "files ranks channels"]:
+    """The mover's six kinds of pieces, the other's, ones, moves without progress, whether the position was there before; in chess also
+    castling rights and the square to capture on in passing.
+
+    Squares lie as pgx numbers its actions, so that a square's moves stand where the square does. pgx itself shows eight positions in over a
+    hundred planes, and counts how often each was there.
+    """
+    is_chess = hasattr(position, "_x")
+    inside = position._x if is_chess else position
+    board, told = (inside.board, inside.hash_history) if is_chess else (inside._board, inside._hash_history)
+    idle = inside.halfmove_count if is_chess else inside._halfmove_count
+    squares = board.shape[0]
+    size = int(np.sqrt(squares))
+    kinds = np.arange(1, 7)
+    pieces = board[:, None] == np.concatenate([kinds, -kinds])[None, :]
+    again = jnp.sum(jnp.all(told == told[:1], axis=1)) > 1
+    whole = [jnp.ones(()), idle.astype(jnp.float32) / 100.0, again.astype(jnp.float32)]
+    whole += list(inside.castling_rights.reshape(-1).astype(jnp.float32)) if is_chess else []
+    planes = [pieces.astype(jnp.float32), jnp.broadcast_to(jnp.stack(whole)[None, :], (squares, len(whole)))]
+    planes += [(jnp.arange(squares) == inside.en_passant).astype(jnp.float32)[:, None]] if is_chess else []
+    return jnp.concatenate(planes, axis=1).reshape(size, size, -1)
 
 
 def _pieces(position: Position) -> np.ndarray:

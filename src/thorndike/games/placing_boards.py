@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from thorndike.games.face import Face
 from thorndike.games.game import Board, Position, Square
+from thorndike.games.go_view import seen_by_mover
 from thorndike.games.turning import turned_board
 
 _LETTERS = "abcdefghijklmnopqrstuvwxyz"
@@ -46,7 +47,7 @@ def _go(size: int) -> Face:
     def ownership(position: Position) -> Float[Array, "height width"]:
         return area(position._x.board.reshape(size, size))
 
-    return _placing(size, "go", "pass", _ALL)._replace(ownership=ownership, komi=_KOMI)
+    return _placing(size, "go", "pass", _ALL)._replace(observe=seen_by_mover, ownership=ownership, komi=_KOMI)
 
 
 def area(stones: Int[Array, "height width"]) -> Float[Array, "height width"]:

@@ -2,6 +2,8 @@
 
 On a CPU dense layers give some ten times the positions a second of a convolution tower of the same use on a small board; ``patches`` first
 looks at every square block of the board with the same weights, as a convolution does, which a line of pieces looks alike in everywhere.
+``squares`` is for games whose moves are numbered square by square as the board is shown (Go, and chess here): convolutions, told what is
+true of the whole board, and every square says by the same weights what its moves are worth.
 """
 
 import math
@@ -18,7 +20,7 @@ from thorndike.networks.dense import dense
 from thorndike.networks.hidden_layers import SHOWN, hidden_layers
 from thorndike.networks.network import Network
 
-TOWERS = ("mlp", "patches", "conv")
+TOWERS = ("mlp", "patches", "conv", "squares")
 OWNERSHIP, SCORE = "ownership", "score"
 """The heads that a network may have beside policy and value."""
 
@@ -53,21 +55,30 @@ class BoardNetwork(nn.Module):
     @nn.compact
     def __call__(self, board: Float[Array, "B H W C"]) -> Said:
         """Board to a policy and a value."""
-        x = squares = self._convolutions(board) if self.tower == "conv" else self._dense_layers(board)
-        if self.tower == "conv":
-            x = self._shown(dense(self.width, _hidden_init, name="last")(squares.reshape((board.shape[0], -1))))
-        value = self._shown(dense(64, _hidden_init, name="value_hidden")(x))
-        said = dense(self.actions, _small_init, name="policy")(x), dense(1, _small_init, name="value")(value)[..., 0]
+        seen, flat = self._tower(board)
+        value = self._shown(dense(64, _hidden_init, name="value_hidden")(flat))
+        logits = self._by_squares(seen, value) if self.tower == "squares" else dense(self.actions, _small_init, name="policy")(flat)
+        said = logits, dense(1, _small_init, name="value")(value)[..., 0]
         if not self.heads:
             return said
         score = dense(1, _small_init, name="score")(value)[..., 0] if SCORE in self.heads else None
-        return *said, BoardHeads(self._ownership(squares, board.shape[:3]) if OWNERSHIP in self.heads else None, score)
+        return *said, BoardHeads(self._ownership(seen, board.shape[:3]) if OWNERSHIP in self.heads else None, score)
 
-    def _ownership(self, squares: Float[Array, "B *F"], shape: tuple[int, ...]) -> Float[Array, "B H W"]:
+    def _tower(self, board: Float[Array, "B H W C"]) -> tuple[Float[Array, "B *F"], Float[Array, "B F"]]:
+        """What was seen, square by square where the tower still knows them apart, and the same as one row."""
+        if self.tower in ("mlp", "patches"):
+            flat = self._dense_layers(board)
+            return flat, flat
+        seen = self._convolutions(board)
+        if self.tower == "squares":
+            return seen, self._pooled(seen)
+        return seen, self._shown(dense(self.width, _hidden_init, name="last")(seen.reshape((board.shape[0], -1))))
+
+    def _ownership(self, seen: Float[Array, "B *F"], shape: tuple[int, ...]) -> Float[Array, "B H W"]:
         """By the same weights at each square, where the tower still knows them apart."""
-        if self.tower == "conv":
-            return Convolution(1, 1, 1, _small_init, name=OWNERSHIP)(squares)[..., 0]
-        return dense(math.prod(shape[1:]), _small_init, name=OWNERSHIP)(squares).reshape(shape)
+        if seen.ndim == 4:
+            return Convolution(1, 1, 1, _small_init, name=OWNERSHIP)(seen)[..., 0]
+        return dense(math.prod(shape[1:]), _small_init, name=OWNERSHIP)(seen).reshape(shape)
 
     def _shown(self, x: Float[Array, "*B F"]) -> Float[Array, "*B F"]:
         activated = nn.relu(x)
@@ -92,9 +103,22 @@ class BoardNetwork(nn.Module):
 
         x = convolution("first", _hidden_init)(board)
         for block in range(self.blocks):
-            inner = self._shown(convolution(f"block_{block}_a", _hidden_init)(self._shown(x)))
-            x = x + convolution(f"block_{block}_b", _small_init)(inner)
+            inner = convolution(f"block_{block}_a", _hidden_init)(self._shown(x))
+            if self.tower == "squares":
+                # What is true of the whole board is told to every square, as KataGo does.
+                inner += dense(self.width, _small_init, name=f"block_{block}_whole")(self._pooled(inner))[:, None, None]
+            x = x + convolution(f"block_{block}_b", _small_init)(self._shown(inner))
         return self._shown(x)
+
+    def _by_squares(self, seen: Float[Array, "B H W F"], value: Float[Array, "B V"]) -> Float[Array, "B actions"]:
+        """Each square's moves by the same weights; what is left of the moves by the whole board."""
+        a_square, others = divmod(self.actions, math.prod(seen.shape[1:3]))
+        policy = [Convolution(a_square, 1, 1, _small_init, same=True, name="policy")(seen).reshape((seen.shape[0], -1))] if a_square else []
+        policy += [dense(others, _small_init, name="policy_others")(value)] if others else []
+        return jnp.concatenate(policy, axis=-1)
+
+    def _pooled(self, x: Float[Array, "B H W C"]) -> Float[Array, "B 2*C"]:
+        return jnp.concatenate([jnp.mean(x, axis=(1, 2)), jnp.max(x, axis=(1, 2))], axis=-1)
 
 
 def board_network(actions: int, tower: str, width: int, blocks: int, heads: tuple[str, ...] = ()) -> Network:
