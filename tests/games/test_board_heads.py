@@ -149,14 +149,14 @@ def test_the_losses_are_those_of_a_slow_loop():
 @pytest.mark.parametrize("tower", TOWERS)
 def test_heads_sit_on_every_tower_and_change_nothing_else(tower):
     board = jax.random.bernoulli(KEY, 0.4, (3, 6, 7, 2)).astype(jnp.float32)
-    plain, network = board_network(7, tower, 16, 1), board_network(7, tower, 16, 1, ("ownership", "score"))
+    plain, network = board_network(45, tower, 16, 1), board_network(45, tower, 16, 1, ("ownership", "score"))
     bare, params = plain.init(KEY, board), network.init(KEY, board)
     assert set(params) - set(bare) == {"ownership", "score"}
     for one, other in zip(plain.apply(bare, board), network.apply(params, board), strict=False):
         np.testing.assert_array_equal(one, other)
     heads = network.apply(params, board)[2]
     assert heads.ownership.shape == (3, 6, 7) and heads.score.shape == (3,)
-    assert board_network(7, tower, 16, 1, ("score",)).apply(params, board)[2].ownership is None
+    assert board_network(45, tower, 16, 1, ("score",)).apply(params, board)[2].ownership is None
     for square in ((0, 0), (5, 6), (2, 3)):
         gradient = jax.grad(lambda p, at=square: network.apply(p, board)[2].ownership[:, at[0], at[1]].sum())(params)
         assert float(jnp.abs(gradient["ownership"]["kernel"]).sum()) > 0 and float(jnp.abs(gradient["policy"]["kernel"]).sum()) == 0
