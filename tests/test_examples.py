@@ -103,6 +103,8 @@ def test_the_search_plays_nim_as_its_theory_says():
     assert nim.action_name(start, int(found.action[0])) == "a2"
 
 
+# Games by a name are trained in games/test_own_games.py too, in less time.
+@pytest.mark.slow
 def test_nim_is_trained_by_its_name(tmp_path, quick_compile):
     name = f"{EXAMPLES / 'own_game.py'}:NIM"
     small = {"n_steps": 2, "batch_size": 16, "gradient_steps": 1, "learning_starts": 32, "num_simulations": 4, "width": 8, "blocks": 0}

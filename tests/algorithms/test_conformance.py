@@ -177,7 +177,11 @@ RUN = {
     "bootstrapped_dqn": Case(bootstrapped_dqn.bootstrapped_dqn, bootstrapped_dqn.Config(**OF_THE_FAMILY, n_members=3), "CartPole-v1"),
     "ppo, bonuses": Case(ppo.ppo, PPO, "CartPole-v1", NEW),
     "q_learning": Case(q_learning.q_learning, parts(TABLE, variant="sarsa"), "MountainCar-v0", BINS),
-    "alphazero": GameCase(alphazero.alphazero, parts(ALPHAZERO, resign_threshold=-0.1, **HEADS, **GATED), SQUARES),
+    # A second search would double what is compiled.
+    "alphazero": GameCase(alphazero.alphazero, parts(ALPHAZERO, full_search_fraction=1.0, **HEADS), SQUARES),
+    "alphazero, fast moves, resignation, gate": GameCase(
+        alphazero.alphazero, parts(ALPHAZERO, resign_threshold=-0.1, **HEADS, **GATED), SQUARES
+    ),
     "muzero": Case(muzero.muzero, MUZERO, "CartPole-v1"),
     "iql": DataCase(iql.iql, iql.Config(**DATA, learning_rate="linear(1e-3, 0)"), DISCRETE),
     "td3_bc": DataCase(td3_bc.td3_bc, td3_bc.Config(**DATA), BOX),
@@ -321,6 +325,7 @@ SLOW = (
     "td3_bc",
     "cql, Box",
     "muzero",
+    "alphazero, fast moves, resignation, gate",
 )
 """Cases whose machinery another one runs too."""
 

@@ -199,3 +199,10 @@ def test_a_search_that_is_stopped_ends_long_before_its_last_simulation(board):
     with pytest.raises(Stopped):
         player.choose(turn(board, "a1")._replace(stopped=stopped))
     assert left == [0], "it asked twice in vain, before the first two parts"
+
+
+def test_a_memory_that_moves_do_not_depend_on_is_none(board):
+    """AlphaZero's counts moves."""
+    counts = stub(prefers_c3)._replace(memory=lambda size: jnp.zeros((size, 1)))
+    choice = agent_player("stub", board.game, counts, chain(), ACTOR, (), {}, 8).choose(turn(board, "a1 a2 b1 b2"))
+    assert sum(choice.visits.values()) == 8

@@ -91,11 +91,9 @@ def train(
     divides; that changes how long it takes and no result. ``env_timeout`` is how many seconds a step of an environment in a process of
     its own may take (60 by default), a reset twice that. ``actor_threads`` play host environments while the learner learns, each a pool of
     ``num_envs`` of its own, on the ``fixed`` schedule, which can be repeated, or the ``free`` one; ``env_restarts`` is how often a pool may
-    be made anew. ``reward`` is a folder of clips, or a reward learnt in one; ``until`` pauses at a step; the ``keep_checkpoints`` newest
-    stay. Raises ``UserError``.
+    be made anew. ``reward`` is a folder of clips; ``until`` pauses at a step; the ``keep_checkpoints`` newest stay. Raises ``UserError``.
     """
-    check_algorithm(algorithm)
-    _check_numbers(seed, seeds, num_envs, keep_checkpoints)
+    _check(algorithm, seed, seeds, num_envs, keep_checkpoints)
     check_source(algorithm, environment)
     of_stepping: dict[str, object] = {"num_envs": num_envs, "wrappers": wrappers, "start_from": start_from, "devices": devices}
     of_stepping |= {"actor_threads": actor_threads, "env_restarts": env_restarts, "reward": reward, "until": until}
@@ -109,11 +107,10 @@ def train(
         refuse_given(of_stepping | {"seeds": seeds > 1, "network": network}, "planning computes the exact values of one table")
         return plan_run(choice, settings or {}, output, name, command)
     settings, started = _begun(start_from, algorithm, choice.id, dict(settings or {}))
-    actors = ActorThreads(actor_threads, actor_schedule, env_restarts)
     learnt, wrappers = begun_with(reward, choice.id, wrappers, found.wrappers)
     request = full_request(
-        algorithm, choice, found, wrappers, settings, steps, num_envs, seeds, seed, checkpoint_every, actors, data, started, learnt,
-        keep_checkpoints,
+        algorithm, choice, found, wrappers, settings, steps, num_envs, seeds, seed, checkpoint_every,
+        ActorThreads(actor_threads, actor_schedule, env_restarts), data, started, learnt, keep_checkpoints,
     )  # fmt: skip
     if data is None:
         prepare_devices(choice, seeds, devices)
@@ -171,7 +168,8 @@ def runs(output: str | Path = "runs") -> list[Path]:
     return sorted((path.parent for path in Path(output).glob("*/*/*/run.json")), key=lambda path: path.name)
 
 
-def _check_numbers(seed: int, seeds: int, num_envs: int | None, keep_checkpoints: int) -> None:
+def _check(algorithm: str, seed: int, seeds: int, num_envs: int | None, keep_checkpoints: int) -> None:
+    check_algorithm(algorithm)
     if keep_checkpoints < KEPT:
         raise UserError(f"the {KEPT} newest checkpoints always stay; got keep_checkpoints={keep_checkpoints}")
     if max(seeds, num_envs or 1) > _MOST:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, PyTree
 
+from thorndike.dependence import looked_at
 from thorndike.errors import UserError
 from thorndike.games.cut_search import cut_search
 from thorndike.games.environment import observed_position
@@ -41,7 +42,7 @@ def agent_player(
     """
     if algorithm.probabilities is None:
         raise UserError(f"{name} tells no probabilities of moves, so it cannot play here: train it with alphazero, muzero or ppo")
-    if jax.tree.leaves(algorithm.memory(1)):
+    if _remembers(game, algorithm, algorithm.probabilities, wrapper, actor, statistics):
         chosen = _remembering(game, algorithm, algorithm.probabilities, wrapper, actor, statistics)
         return Player(name, lambda turn: Choice(chosen(turn)), identity=fingerprint((actor, statistics)))
     evaluate = _evaluation(game, algorithm, algorithm.probabilities, wrapper, statistics)
@@ -63,6 +64,16 @@ def agent_player(
         return Choice(int(action[0]), min(max(float(value[0] + 1) / 2, 0.0), 1.0) if game.can_be_searched else None)
 
     return Player(name, choose, identity=fingerprint((actor, statistics)))
+
+
+def _remembers(game: Game, algorithm: Algorithm, probabilities: Callable, wrapper: Wrapper, actor: PyTree, statistics: PyTree) -> bool:
+    """Whether its moves depend on its memory; AlphaZero's counts the moves of a game, which is nothing to the network."""
+
+    def asked(memory: PyTree) -> PyTree:
+        position = jax.tree.map(lambda leaf: leaf[None], observed_position(game, game.init(jax.random.key(0))))
+        return probabilities(actor, memory, wrapper.init(statistics, position)[1])
+
+    return any(looked_at(asked, algorithm.memory(1)))
 
 
 def _remembering(

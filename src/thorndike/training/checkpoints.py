@@ -14,6 +14,7 @@ from typing import NamedTuple, TypeVar, cast
 import jax
 from jaxtyping import PyTree
 
+from thorndike.dependence import looked_at
 from thorndike.errors import UserError
 from thorndike.training.host_source import HostSource
 from thorndike.training.json_files import OBJECT, SECONDS, Json, as_bytes, check_fields, parse_object, whole
@@ -144,7 +145,7 @@ def read_actors(
     ``statistics`` are the shapes of one seed's, by the wrapper's place in the chain. Raises ``UserError``.
     """
     shapes, structure = jax.tree.flatten(jax.eval_shape(algorithm.init, jax.random.key(0)))
-    acts = _looked_at(algorithm.actor, jax.tree.unflatten(structure, shapes))
+    acts = looked_at(algorithm.actor, jax.tree.unflatten(structure, shapes))
     part = jax.tree.unflatten(structure, [_of_seeds(leaf, seeds) if used else None for leaf, used in zip(shapes, acts, strict=True)])
     held = {str(place): jax.tree.map(lambda leaf: _of_seeds(leaf, seeds), tree) for place, tree in statistics.items()}
     learner, learnt = read_tree((part, {"statistics": held} if compiled else held), SealedFolder(folder), STATE, part=True)
@@ -155,13 +156,6 @@ def read_actors(
 
     found = learnt["statistics"] if compiled else learnt
     return jax.vmap(actor)(learner), tuple(found[str(place)] for place in statistics)
-
-
-def _looked_at(function: Callable[[PyTree], PyTree], tree: PyTree) -> list[bool]:
-    """Of each leaf of the argument: whether the result depends on it."""
-    traced = jax.make_jaxpr(function)(tree).jaxpr
-    used = {id(each) for equation in traced.eqns for each in equation.invars} | {id(each) for each in traced.outvars}
-    return [id(each) in used for each in traced.invars]
 
 
 def _of_seeds(leaf: jax.ShapeDtypeStruct, seeds: int) -> jax.ShapeDtypeStruct:
