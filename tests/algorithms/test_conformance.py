@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from made_up_data import BOX, DISCRETE, made_up
+from squares_game import SQUARES
 from thorndike.algorithms import (
     a2c,
     a3c,
@@ -42,6 +43,7 @@ from thorndike.environments import novelty, wrappers
 from thorndike.environments.native import factory
 from thorndike.environments.native.vectorize import vectorize
 from thorndike.games.environment import game_environment
+from thorndike.games.game import Game
 from thorndike.games.registry import game
 from thorndike.networks.torso import example_observation
 from thorndike.training import segment as segment_module
@@ -104,10 +106,11 @@ class GameCase(NamedTuple):
 
     build: object
     config: object
-    game: str
+    game: str | Game
 
     def make(self) -> tuple[Algorithm, Source]:
-        environment = game_environment(game(self.game), NUM_ENVS)
+        rules = game(self.game) if isinstance(self.game, str) else self.game
+        environment = game_environment(rules, NUM_ENVS)
         algorithm = self.build(self.config, environment.spec)
         return algorithm, compiled_source(environment, algorithm, wrappers.chain())
 
@@ -133,6 +136,8 @@ ALPHAZERO = alphazero.Config(
     blocks=1,
     learning_rate="linear(1e-3, 0)",
 )
+HEADS = {"ownership_coef": 1.0, "score_coef": 0.1}
+GATED = {"gate_every": 3, "gate_games": 4, "gate_threshold": 0.5}
 MUZERO = muzero.Config(
     total_steps=1000,
     buffer_size=120,
@@ -172,7 +177,7 @@ RUN = {
     "bootstrapped_dqn": Case(bootstrapped_dqn.bootstrapped_dqn, bootstrapped_dqn.Config(**OF_THE_FAMILY, n_members=3), "CartPole-v1"),
     "ppo, bonuses": Case(ppo.ppo, PPO, "CartPole-v1", NEW),
     "q_learning": Case(q_learning.q_learning, parts(TABLE, variant="sarsa"), "MountainCar-v0", BINS),
-    "alphazero": GameCase(alphazero.alphazero, parts(ALPHAZERO, resign_threshold=-0.1), "tic_tac_toe"),
+    "alphazero": GameCase(alphazero.alphazero, parts(ALPHAZERO, resign_threshold=-0.1, **HEADS, **GATED), SQUARES),
     "muzero": Case(muzero.muzero, MUZERO, "CartPole-v1"),
     "iql": DataCase(iql.iql, iql.Config(**DATA, learning_rate="linear(1e-3, 0)"), DISCRETE),
     "td3_bc": DataCase(td3_bc.td3_bc, td3_bc.Config(**DATA), BOX),
@@ -184,6 +189,7 @@ ALL = RUN | {
     "sac, held noise": Case(sac.sac, sac.Config(**CONTROL, use_sde=True), "Pendulum-v1"),
     "ppo, Box, held noise, gru": Case(ppo.ppo, parts(PPO, use_sde=True, memory="gru", memory_size=8), "Pendulum-v1"),
     "ppo, Box, beta": Case(ppo.ppo, parts(PPO, action_distribution="beta"), "Pendulum-v1"),
+    "alphazero, plain": GameCase(alphazero.alphazero, ALPHAZERO, "tic_tac_toe"),
     "alphazero, puct": GameCase(alphazero.alphazero, parts(ALPHAZERO, search="puct", tower="patches"), "connect_four"),
     "alphazero, conv": GameCase(alphazero.alphazero, parts(ALPHAZERO, tower="conv", full_search_fraction=1.0), "connect_four"),
     "muzero, a game, puct": GameCase(muzero.muzero, parts(MUZERO, search="puct"), "tic_tac_toe"),

@@ -70,6 +70,9 @@ class SlowOthello:
     def rows(self) -> tuple[tuple[str, ...], ...]:
         return tuple(tuple(self.board[r, c] for c in range(8)) for r in range(8))
 
+    def owners(self) -> list[list[int]]:
+        return [[(self.board[r, c] == "X") - (self.board[r, c] == "O") for c in range(8)] for r in range(8)]
+
     def rewards(self) -> list[int]:
         lead = sum((piece == "X") - (piece == "O") for piece in self.board.values())
         return [int(np.sign(lead)), -int(np.sign(lead))] if self.over else [0, 0]
@@ -145,13 +148,14 @@ class SlowGo:
     def over(self) -> bool:
         return self.passes >= 2 or self.repeated
 
+    def owners(self) -> list[list[int]]:
+        """1 in black's area, -1 in white's."""
+        beside = {at: {stone} if stone else {self.board[square] for square in self.group(at)[1]} for at, stone in self.board.items()}
+        return [[(beside[r, c] == {"X"}) - (beside[r, c] == {"O"}) for c in range(self.size)] for r in range(self.size)]
+
     def score(self) -> float:
         """Black's area less white's, less komi."""
-        total = 0
-        for at, stone in self.board.items():
-            owners = {stone} if stone else {self.board[square] for square in self.group(at)[1]}
-            total += (owners == {"X"}) - (owners == {"O"})
-        return total - 7.5
+        return sum(map(sum, self.owners())) - 7.5
 
     def rewards(self) -> list[int]:
         if not self.over:

@@ -1,5 +1,6 @@
 """AlphaZero: its losses, what it refuses, and tic-tac-toe learnt from nothing until no line is lost."""
 
+import json
 from pathlib import Path
 
 import jax
@@ -11,6 +12,7 @@ import thorndike as td
 import tic_tac_toe_lines as lines
 from thorndike.algorithms.alphazero import Config, alphazero, alphazero_loss
 from thorndike.api.building import build_algorithm
+from thorndike.environments.wrappers import normalize_observation
 from thorndike.errors import UserError
 from thorndike.games.environment import game_environment, observed_position
 from thorndike.games.self_play import Batch
@@ -64,14 +66,22 @@ def test_what_is_no_game_of_two_is_refused():
     spec = game_environment(TIC_TAC_TOE, 2).spec
     with pytest.raises(UserError, match=r"two players without dice.*train it with ppo"):
         alphazero(Config(), spec._replace(game=TIC_TAC_TOE._replace(has_chance=True)))
+    for name in ("alphazero", "muzero"):
+        with pytest.raises(UserError, match=r"tic_tac_toe is learnt from its board as the rules show it, which a wrapper changes"):
+            build_algorithm(name, {}, normalize_observation().spec(spec), None)
 
 
 def test_a_run_is_saved_loaded_and_gone_on_with(tmp_path: Path, quick_compile: None):
+    """With the heads that no search asks, which are exported beside the others, and a gate that lets all pass."""
     small = {"n_steps": 2, "batch_size": 32, "gradient_steps": 1, "learning_starts": 64, "num_simulations": 4, "width": 8, "blocks": 0}
-    result = td.train("alphazero", "tic_tac_toe", steps=256, num_envs=16, settings=small, preset="none", output=tmp_path)
+    small |= {"ownership_coef": 1.0, "score_coef": 0.1, "gate_every": 2, "gate_games": 2, "gate_threshold": 0.0}
+    game = f"{Path(__file__).parents[1] / 'squares_game.py'}:SQUARES"
+    result = td.train("alphazero", game, steps=256, num_envs=16, settings=small, preset="none", output=tmp_path)
     evaluation = td.load(result.run).evaluate(episodes=10)
     assert -1 <= evaluation.mean <= 1 and len(evaluation.rows) == 10
     assert td.resume(result.run, steps=320).steps == 320
+    logged = json.loads((result.run / "metrics.jsonl").read_text().splitlines()[-1])
+    assert {"train/ownership_loss", "train/score_loss", "train/gate_score"} <= set(logged) and logged["train/gates_passed"][0] > 1
     policy = td.load(result.run)
     obs = jax.tree.map(np.asarray, observed_position(TIC_TAC_TOE, TIC_TAC_TOE.init(jax.random.key(0))))
     action, _ = policy.predict(obs)

@@ -48,7 +48,7 @@ def test_random_games_keep_the_slow_rules(compiled):
     if made.id not in SLOW_RULES:
         return check_any(compiled)
     random = np.random.default_rng(3)
-    winners = set()
+    winners, look = set(), jax.jit(lambda position: (made.ownership(position), made.observe(position)))
     for _ in range({"othello": 6, "hex": 4, "go_9x9": 3}[made.id]):
         slow, moves = SLOW_RULES[made.id](), 0
         for position, action in random_moves(random, compiled):
@@ -56,12 +56,19 @@ def test_random_games_keep_the_slow_rules(compiled):
             assert over == slow.over
             assert rewards.tolist() == slow.rewards()
             assert made.board(position).rows == slow.rows()
+            if made.ownership is not None and (over or moves % 20 == 0):
+                owner, seen = (np.asarray(x) for x in look(position))
+                assert owner.tolist() == slow.owners()
+                # The mover's stones and the other's lie on squares that are theirs, of a board that is not turned with the mover.
+                stones = (seen[..., 0] - seen[..., 1]) * (1 - 2 * player)
+                np.testing.assert_array_equal(owner[stones != 0], stones[stones != 0])
             if action is not None:
                 assert sorted(made.action_name(position, move) for move in legal) == sorted(slow.legal())
                 assert player == "XO".index(slow.mover)
                 slow.play(made.action_name(position, action))
                 moves += 1
         assert moves <= made.max_moves
+        assert (made.ownership is None) == (made.id == "hex") and made.komi == (7.5 if made.id == "go_9x9" else 0)
         winners.add(tuple(rewards))
     assert len(winners) > 1
     return None

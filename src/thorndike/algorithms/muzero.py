@@ -36,7 +36,7 @@ from thorndike.functional.unrolled_targets import UnrolledTargets
 from thorndike.functional.value_transform import Scale
 from thorndike.games.board_view import view_of
 from thorndike.games.imagined_search import Imagination, Thought, imagine, think
-from thorndike.games.search import SEARCHES, Found, SearchSettings
+from thorndike.games.search import SEARCHES, Found, settings_from
 from thorndike.networks.cnn import CNNS
 from thorndike.networks.hidden_layers import look_into
 from thorndike.networks.learned_model import ModelShape, learned_model, unroll
@@ -140,9 +140,7 @@ class Parts(NamedTuple):
 
     def look_ahead(self, simulations: int, explore: bool, params: PyTree, obs: Observation, key: Key[Array, ""]) -> Found:
         """A search from observations ``[B]``. Consumes the key."""
-        c = self.config
-        noise, bandit = (c.dirichlet_alpha, c.dirichlet_fraction, c.c_puct), (c.considered_moves, c.value_scale, c.rescale_values)
-        settings = SearchSettings(c.search, simulations, *noise, *bandit)
+        settings = settings_from(vars(self.config), simulations)
         return imagine(self.imagination, settings, params, self.imagination.view.see(obs), key, explore)
 
 
@@ -185,7 +183,7 @@ def build_parts(config: Config, spec: EnvSpec) -> Parts:
     if not isinstance(spec.action_space, gymnasium.spaces.Discrete):
         raise UserError(f"muzero takes Discrete actions; {spec.id} has {spec.action_space}; ppo, sac and td3 take the others")
     game, of_two = spec.game, spec.game is not None and spec.game.num_players == 2
-    if of_two and game is not None and game.has_chance:
+    if game is not None and of_two and not game.can_be_searched:
         raise UserError(f"muzero plays games of two players without dice (connect_four, ...), which {spec.id} is not: train it with ppo")
     actions, shape = int(spec.action_space.n), ModelShape(config.net_arch, config.cnn, config.state_size, config.width)
     view = view_of(spec, actions, config.symmetries)

@@ -47,7 +47,7 @@ def player(who: PlayerLike, game: Game | str, *, simulations: int = SIMULATIONS,
     if isinstance(who, Player):
         return who
     if isinstance(who, str):
-        check_player(who, rules.id, rules.num_players == 2 and not rules.has_chance)
+        check_player(who, rules.id, rules.can_be_searched)
         if who == RANDOM:
             return random_player(seed)
         if who.partition(":")[0] == MCTS:

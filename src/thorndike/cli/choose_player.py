@@ -6,7 +6,7 @@ from pathlib import Path
 from thorndike.cli.find_run import exists, find_run
 from thorndike.errors import UserError
 from thorndike.games.player_names import check_player, is_run, known_players, suggestion
-from thorndike.games.registry import FOR_ONE, WITH_DICE, game, game_ids
+from thorndike.games.registry import FOR_ONE, can_be_searched, game, game_ids
 from thorndike.records import from_policy, read_policy_facts
 from thorndike.suggestions import did_you_mean
 from thorndike.training.run_listing import all_runs, read_facts
@@ -23,8 +23,7 @@ def check_game(name: str, alone: bool) -> bool:
     if importlib.util.find_spec("mctx") is None:
         raise UserError("games are searched with mctx, which is not installed: pip install 'thorndike[games]'")
     if ":" in name:
-        found = game(name)
-        one = found.num_players == 1
+        one = game(name).num_players == 1
     else:
         if name not in game_ids():
             raise UserError(f"unknown game {name!r}{did_you_mean(name, game_ids())}")
@@ -32,14 +31,6 @@ def check_game(name: str, alone: bool) -> bool:
     if one and not alone:
         raise UserError(f"{name} is played by one, so nobody can play against anybody; see: thorndike play {name}")
     return one
-
-
-def can_be_searched(name: str) -> bool:
-    """Whether plain search plays it: a game of two without dice."""
-    if ":" in name:
-        found = game(name)
-        return found.num_players == 2 and not found.has_chance
-    return name not in (*WITH_DICE, *FOR_ONE)
 
 
 def choose_player(text: str, game_name: str, output: Path) -> str | Path:

@@ -56,9 +56,8 @@ def _begin(game: str, against: str | Path | None, simulations: int, second: bool
 
     rules = find_game(game)
     opponent = None if against is None else player(against, game, simulations=simulations, seed=seed)
-    searched = rules.num_players == 2 and not rules.has_chance
     adviser = opponent if opponent is not None and opponent.name != "random" else None
-    if adviser is None and searched:
+    if adviser is None and rules.can_be_searched:
         adviser = player("mcts", rules, simulations=max(simulations, 1), seed=seed)
     compiles = opponent is not None and not (isinstance(against, str) and is_engine(against))
     return TerminalGame(rules, opponent, adviser, 1 if second else 0, seed, compiles)

@@ -12,7 +12,7 @@ from thorndike.errors import UserError
 from thorndike.games.environment import observed_position
 from thorndike.games.game import Choice, Game, Player, Position, Turn
 from thorndike.games.players import choice_of
-from thorndike.games.search import Evaluate, SearchSettings, search
+from thorndike.games.search import Evaluate, search, settings_from
 from thorndike.networks.masking import FORBIDDEN
 from thorndike.types import Algorithm, Wrapper
 
@@ -38,8 +38,8 @@ def agent_player(
     if algorithm.probabilities is None:
         raise UserError(f"{name} tells no probabilities of moves, so it cannot play here: train it with alphazero, muzero or ppo")
     evaluate = _evaluation(game, algorithm, algorithm.probabilities, wrapper, statistics)
-    settings = _settings(config, max(simulations, 1))
-    searches = simulations > 0 and game.num_players == 2 and not game.has_chance
+    settings = settings_from(config, max(simulations, 1))
+    searches = simulations > 0 and game.can_be_searched
 
     def deep(position: Position) -> PyTree:
         return search(game, evaluate, settings, actor, position, jax.random.key(0), explore=False)
@@ -55,8 +55,7 @@ def agent_player(
         if searches:
             return choice_of(found)
         action, value = jax.device_get(found)
-        of_two = game.num_players == 2 and not game.has_chance
-        return Choice(int(action[0]), min(max(float(value[0] + 1) / 2, 0.0), 1.0) if of_two else None)
+        return Choice(int(action[0]), min(max(float(value[0] + 1) / 2, 0.0), 1.0) if game.can_be_searched else None)
 
     return Player(name, choose, identity=fingerprint((actor, statistics)))
 
@@ -81,10 +80,3 @@ def _evaluation(game: Game, algorithm: Algorithm, probabilities: Callable, wrapp
         return jnp.log(jnp.maximum(chances, 1e-12)), jnp.clip(algorithm.value(actor, seen), -1.0, 1.0)
 
     return evaluate
-
-
-def _settings(config: Mapping[str, object], simulations: int) -> SearchSettings:
-    """Those that the policy was trained with, by the names of ``SearchSettings``; ``search`` is the kind."""
-    values = SearchSettings()._asdict()
-    values |= {name: config[name] for name in values if name in config}
-    return SearchSettings(**values | {"kind": config.get("search", values["kind"]), "simulations": simulations})

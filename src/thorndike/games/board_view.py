@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from jaxtyping import Array, Bool, PyTree
 
-from thorndike.games.environment import BOARD, check_observations
+from thorndike.games.environment import BOARD, check_unchanged
 from thorndike.games.game import Game
 from thorndike.networks.masking import MASK, allowed, check_mask, has_mask
 from thorndike.replay.unrolled import Unrolled
@@ -42,7 +42,7 @@ def view_of(spec: EnvSpec, actions: int, symmetries: bool = True) -> View:
     see: Callable[[Observation], Observation] = _as_it_is
     turn: Callable[[Unrolled], Unrolled] = _as_it_is
     if spec.game is not None:
-        check_observations(spec, spec.game)
+        check_unchanged(spec, spec.game)
         size = int(np.prod(spec.game.observation_shape))
         space = spaces.Dict({BOARD: spaces.Box(-np.inf, np.inf, (size,), np.float32), MASK: spaces.MultiBinary(actions)})
         see = _board_and_mask

@@ -11,7 +11,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple
 
 from thorndike.errors import UserError
-from thorndike.games.registry import FOR_ONE, WITH_DICE
+from thorndike.games.registry import can_be_searched
 from thorndike.suggestions import did_you_mean
 
 if TYPE_CHECKING:
@@ -130,7 +130,7 @@ def check_engine(text: str, game: str) -> None:
         found = ENGINES[name]
         read_settings(name, rest, {**found.settings, **LIMIT})
         if game not in found.games:
-            others = "random and" if game in (*FOR_ONE, *WITH_DICE) else "random, mcts and"
+            others = "random, mcts and" if can_be_searched(game) else "random and"
             raise UserError(f"{name} plays {' and '.join(found.games)}, not {game}; there play {others} trained runs")
         program_of(found)
 

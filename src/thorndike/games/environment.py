@@ -47,6 +47,16 @@ def check_observations(spec: EnvSpec, game: Game) -> None:
         raise UserError(f"{spec.id} is learnt from its positions, which a wrapper hides or changes: leave the wrapper out")
 
 
+def check_unchanged(spec: EnvSpec, game: Game) -> None:
+    """Raises ``UserError`` also if a wrapper changes the numbers of a board.
+
+    A learner that searches or turns boards as the rules show them would be asked about the changed ones for a value alone.
+    """
+    check_observations(spec, game)
+    if getattr(spec.observation_space, "spaces", {})[BOARD] != observation_space(game)[BOARD]:
+        raise UserError(f"{spec.id} is learnt from its board as the rules show it, which a wrapper changes (normalizes): leave it out")
+
+
 def observed_position(game: Game, position: Position) -> Observation:
     """One position as an observation."""
     return {
@@ -66,7 +76,7 @@ def game_environment(game: Game, num_envs: int, settings: GameSettings = SELF_PL
     share, plies = settings.opening_share, usual if settings.opening_plies is None else settings.opening_plies
     if num_envs < 1:
         raise UserError(f"num_envs of {game.id} must be at least 1, not {num_envs}: give a larger number")
-    check_opponent(game.id, settings.opponent, game.num_players == 2 and not game.has_chance)
+    check_opponent(game.id, settings.opponent, game.can_be_searched)
     pool = -(-num_envs // _POOL)
 
     observe = jax.vmap(lambda position: observed_position(game, position))

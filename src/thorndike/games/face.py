@@ -17,3 +17,6 @@ class Face(NamedTuple):
     symmetries: tuple[Symmetry, ...] = ()
     observe: Callable[[Position], Float[Array, "height width channels"]] | None = None
     """What the player to move sees, where pgx's own form is hard to learn from."""
+    ownership: Callable[[Position], Float[Array, "height width"]] | None = None
+    """Whose the squares are, where that decides the game."""
+    komi: float = 0.0

@@ -70,9 +70,20 @@ class Game(NamedTuple):
     """A legal action as players of this game write it: ``d`` or ``e2e4``. Not to be traced; ``named_action`` goes the other way."""
     symmetries: tuple[Symmetry, ...] = ()
     """Others than leaving it as it is."""
+    ownership: Callable[[Position], Float[Array, "height width"]] | None = None
+    """Of a game that is decided by whose the squares are: of a finished position 1 where one is player 0's, -1 player 1's, 0 nobody's.
+
+    The squares are those of ``observe``, which then must not turn the board with the mover."""
+    komi: float = 0.0
+    """Squares that player 1 is given for moving second, in such a game."""
     num_players: int = 2
     has_chance: bool = False
     """Whether dice are thrown, so that a search needs chance nodes."""
+
+    @property
+    def can_be_searched(self) -> bool:
+        """Whether it is a game of two without dice, which is what a search looks ahead in."""
+        return self.num_players == 2 and not self.has_chance
 
 
 class Choice(NamedTuple):

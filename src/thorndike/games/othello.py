@@ -86,6 +86,11 @@ def _observe(position: OthelloPosition) -> Float[Array, "8 8 2"]:
     return jnp.stack([_bits(own[0]), _bits(own[1])], axis=-1).astype(jnp.float32).reshape(_SIZE, _SIZE, 2)
 
 
+def _ownership(position: OthelloPosition) -> Float[Array, "8 8"]:
+    black, white = (_bits(stones).astype(jnp.float32) for stones in position.stones)
+    return (black - white).reshape(_SIZE, _SIZE)
+
+
 def _sides(position: OthelloPosition) -> tuple[Words, Words]:
     """The mover's stones, the other's."""
     first = position.mover == 0
@@ -145,4 +150,5 @@ OTHELLO = Game(
     action_name=_action_name,
     # A quarter turn of the beginning exchanges the colours: no game looks like that.
     symmetries=(turned_board(_SIZE, 2, False), turned_board(_SIZE, 1, True), turned_board(_SIZE, 3, True)),
+    ownership=_ownership,
 )

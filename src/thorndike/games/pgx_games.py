@@ -120,6 +120,8 @@ def pgx_game(id: str) -> Game:
         board=board,
         action_name=lambda position, action: face.action_name(position, int(action)),
         symmetries=face.symmetries,
+        ownership=face.ownership,
+        komi=face.komi,
         num_players=env.num_players,
         has_chance=id in _HAS_CHANCE,
     )

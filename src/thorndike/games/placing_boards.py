@@ -2,7 +2,10 @@
 
 from collections.abc import Sequence
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
 from thorndike.games.face import Face
 from thorndike.games.game import Board, Position, Square
@@ -12,6 +15,8 @@ from thorndike.games.turning import turned_board
 _LETTERS = "abcdefghijklmnopqrstuvwxyz"
 _GO_LETTERS = "ABCDEFGHJKLMNOPQRSTUVWXYZ"
 """Go players leave the I out."""
+_KOMI = 7.5
+"""pgx's."""
 Turns = tuple[tuple[int, bool], ...]
 """Quarter turns, and whether the board is mirrored first."""
 _ALL: Turns = tuple((turns, mirrored) for mirrored in (False, True) for turns in range(4))[1:]
@@ -38,6 +43,30 @@ def _placing(size: int, kind: str, extra: str, turns: Turns) -> Face:
     return Face(board, action_name, tuple(turned_board(size, *turn) for turn in turns))
 
 
+def _go(size: int) -> Face:
+    def ownership(position: Position) -> Float[Array, "height width"]:
+        return area(position._x.board.reshape(size, size))
+
+    return _placing(size, "go", "pass", _ALL)._replace(observe=seen_by_mover, ownership=ownership, komi=_KOMI)
+
+
+def area(stones: Int[Array, "height width"]) -> Float[Array, "height width"]:
+    """By Go's area scoring: 1 at black's stones (above 0) and where only black is reached through empty points, -1 so for white, else 0.
+
+    Dead stones stay, as in pgx: who wants them off the board has to take them.
+    """
+    empty, colours = stones == 0, jnp.stack([stones > 0, stones < 0])
+
+    def grow(carry: tuple[Bool[Array, "2 height width"], Bool[Array, ""]]) -> tuple[Bool[Array, "2 height width"], Bool[Array, ""]]:
+        reached = jnp.pad(carry[0], ((0, 0), (1, 1), (1, 1)))
+        beside = reached[:, 2:, 1:-1] | reached[:, :-2, 1:-1] | reached[:, 1:-1, 2:] | reached[:, 1:-1, :-2]
+        after = carry[0] | (beside & empty[None])
+        return after, jnp.any(after != carry[0])
+
+    black, white = jax.lax.while_loop(lambda carry: carry[1], grow, (colours, jnp.array(True)))[0].astype(jnp.float32)
+    return black - white
+
+
 def _stones(position: Position, kind: str) -> np.ndarray:
     """Above 0 where player 0 is, below where player 1 is."""
     stones = np.asarray(position._x.board)
@@ -46,5 +75,5 @@ def _stones(position: Position, kind: str) -> np.ndarray:
 
 
 HEX = _placing(11, "hex", "swap", _HEX)
-GO_9X9 = _placing(9, "go", "pass", _ALL)._replace(observe=seen_by_mover)
-GO_19X19 = _placing(19, "go", "pass", _ALL)._replace(observe=seen_by_mover)
+GO_9X9 = _go(9)
+GO_19X19 = _go(19)

@@ -41,6 +41,11 @@ def game_ids() -> tuple[str, ...]:
     return (*OWN_GAMES, *ADAPTED_GAMES)
 
 
+def can_be_searched(name: str) -> bool:
+    """What its ``Game`` says of itself, before it is made: whether it is a game of two without dice."""
+    return game(name).can_be_searched if ":" in name else name not in (*FOR_ONE, *WITH_DICE)
+
+
 def is_game(name: str) -> bool:
     """Whether ``game(name)`` finds one. Code of the user's is imported for it, for nothing else tells."""
     if name in OWN_GAMES or name in ADAPTED_GAMES:

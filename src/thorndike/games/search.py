@@ -8,7 +8,7 @@ A value is always that of the player to move, so it changes its sign from one no
 twice). Below a finished position nothing counts (``discount`` 0), and nothing begins anew there.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import NamedTuple, TypeAlias
 
@@ -20,7 +20,9 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from thorndike.errors import UserError
 from thorndike.games.game import Game, Position
 from thorndike.games.tree_loop import Simulations
+from thorndike.networks.board import win_value
 from thorndike.networks.masking import FORBIDDEN
+from thorndike.networks.network import Network
 
 SEARCHES = ("gumbel", "puct")
 
@@ -50,6 +52,13 @@ class SearchSettings(NamedTuple):
     """Stretch the values of a node's moves to [0, 1] first: where nobody knows how large values are."""
 
 
+def settings_from(config: Mapping[str, object], simulations: int) -> SearchSettings:
+    """Of a learner's settings those of its search, by the same names; ``search`` is the kind."""
+    values = SearchSettings()._asdict()
+    values |= {name: config[name] for name in values if name in config}
+    return SearchSettings(**values | {"kind": config.get("search", values["kind"]), "simulations": simulations})
+
+
 class Found(NamedTuple):
     """What a search of positions ``[B]`` found."""
 
@@ -77,7 +86,7 @@ def search(
 
     Raises ``UserError`` for games of one player, and games with dice.
     """
-    if game.num_players != 2 or game.has_chance:
+    if not game.can_be_searched:
         raise UserError(f"the search is for two players without dice, which {game.id} is not")
     key_root, key_search = jax.random.split(key)
     logits, value = evaluate(params, positions, key_root)
@@ -187,6 +196,17 @@ def _completed(settings: SearchSettings) -> Callable[[mctx.Tree, Int[Array, ""]]
         return mctx.qtransform_completed_by_mix_value(tree, node, value_scale=settings.value_scale, rescale_values=settings.rescale_values)
 
     return transform
+
+
+def by_network(game: Game, network: Network) -> Evaluate:
+    """The evaluation of a network of boards."""
+
+    def evaluate(params: PyTree, positions: Position, key: Key[Array, ""]) -> tuple[Float[Array, "B actions"], Float[Array, " B"]]:
+        del key
+        logits, win, *_ = network.apply(params, jax.vmap(game.observe)(positions))
+        return logits, win_value(win)
+
+    return evaluate
 
 
 def by_playouts(game: Game) -> Evaluate:

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from thorndike.games.board_heads import HeadTargets, head_targets, turned
 from thorndike.games.game import Game
 from thorndike.games.packing import packing
 from thorndike.games.search import Found
@@ -80,18 +81,21 @@ class Batch(NamedTuple):
     policy_weight: Float[Array, " M"]
     outcome: Float[Array, " M"]
     value_weight: Float[Array, " M"]
+    ending: HeadTargets | None = None
 
 
 def as_batch(game: Game, rows: Rows, symmetries: bool) -> Batch:
     """Sampled rows as the network sees them; with ``symmetries`` each way to turn the board takes an equal part of them."""
     positions = jax.vmap(packing(game).unpack)(rows.position)
     board, legal, policy = jax.vmap(game.observe)(positions), jax.vmap(game.legal)(positions), rows.policy
+    ending = None if rows.ending is None else head_targets(game, rows.player, rows.ending)
     ways = len(game.symmetries) + 1
     for i, symmetry in enumerate(game.symmetries if symmetries else (), start=1):
         part = slice(i, None, ways)
         board = board.at[part].set(jax.vmap(symmetry.observation)(board[part]))
         policy, legal = (x.at[part].set(x[part][:, symmetry.actions]) for x in (policy, legal))
-    return Batch(board, legal, policy, rows.policy_weight, rows.outcome, rows.known.astype(jnp.float32))
+        ending = None if ending is None else turned(ending, part, symmetry)
+    return Batch(board, legal, policy, rows.policy_weight, rows.outcome, rows.known.astype(jnp.float32), ending)
 
 
 def false_resignations(rows: Rows) -> tuple[Float[Array, ""], Float[Array, ""]]:

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from thorndike.errors import UserError
-from thorndike.games.registry import FOR_ONE, WITH_DICE
+from thorndike.games.registry import can_be_searched
 from thorndike.suggestions import did_you_mean
 
 OPPONENTS = ("random", "mcts")
@@ -43,13 +43,13 @@ def game_settings(id: str, given: Mapping[str, object], max_episode_steps: int |
         raise UserError(f"{id}: eval_opening_plies is a number of moves, 0 or more, not {eval_plies!r}")
     if not isinstance(opponent, str) or opponent not in OPPONENTS:
         raise UserError(f"{id}: unknown opponent {opponent!r}{did_you_mean(str(opponent), OPPONENTS)}")
-    check_opponent(id, opponent, can_be_searched=id not in (*FOR_ONE, *WITH_DICE))
+    check_opponent(id, opponent, can_be_searched(id))
     if not isinstance(simulations, int) or simulations < 1:
         raise UserError(f"{id}: opponent_simulations is at least 1, not {simulations!r}")
     return GameSettings(share, plies, opponent, simulations, eval_plies)
 
 
-def check_opponent(id: str, opponent: str, can_be_searched: bool) -> None:
+def check_opponent(id: str, opponent: str, searched: bool) -> None:
     """Raises ``UserError`` for an opponent that searches a game with dice, or of one player."""
-    if opponent == "mcts" and not can_be_searched:
+    if opponent == "mcts" and not searched:
         raise UserError(f"{id}: the opponent mcts plays games of two players without dice: leave opponent={opponent!r} out")

@@ -10,6 +10,17 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Int8, Int32, Key
 
 
+class Ending(NamedTuple):
+    """How the board looked when games had ended, with any leading axes. It lies in the ring once a game, with the row that ended it."""
+
+    owner: Int8[Array, "*rows H W"]
+    """Whose each square was: 1 player 0's, -1 player 1's, 0 nobody's."""
+    counts: Bool[Array, "*rows"]
+    """Whether the squares decided the game."""
+    step: Int32[Array, "*rows"]
+    """The step of the ring in which the row's game ended, once that is known."""
+
+
 class Rows(NamedTuple):
     """Positions in which somebody moved, with any leading axes."""
 
@@ -27,6 +38,8 @@ class Rows(NamedTuple):
     """Whether the outcome is known."""
     resigns: Bool[Array, "*rows"]
     """Whether the mover would have resigned a game that was played on."""
+    ending: Ending | None = None
+    """Of the board, where something is to be learnt from it."""
 
 
 class SelfPlayBuffer(NamedTuple):
@@ -39,9 +52,10 @@ class SelfPlayBuffer(NamedTuple):
     """Steps stored, at most N."""
 
 
-def init_self_play(steps: int, games: int, words: int, actions: int) -> SelfPlayBuffer:
-    """An empty ring for ``steps`` steps of ``games`` games."""
+def init_self_play(steps: int, games: int, words: int, actions: int, board: tuple[int, int] | None = None) -> SelfPlayBuffer:
+    """An empty ring for ``steps`` steps of ``games`` games; with a height and width, it keeps how the ``board`` looked in the end."""
     lead = (steps, games)
+    nothing = None if board is None else Ending(jnp.zeros((*lead, *board), jnp.int8), jnp.zeros(lead, bool), jnp.zeros(lead, jnp.int32))
     rows = Rows(
         position=jnp.zeros((*lead, words), jnp.int32),
         player=jnp.zeros(lead, jnp.int8),
@@ -50,6 +64,7 @@ def init_self_play(steps: int, games: int, words: int, actions: int) -> SelfPlay
         outcome=jnp.zeros(lead, jnp.float32),
         known=jnp.zeros(lead, bool),
         resigns=jnp.zeros(lead, bool),
+        ending=nothing,
     )
     return SelfPlayBuffer(rows, jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32))
 
@@ -58,7 +73,7 @@ def add_self_play(buffer: SelfPlayBuffer, new: Rows, reward: Float[Array, "T B"]
     """Write ``T`` steps over the oldest ones and tell the outcomes of the games that ended to all their rows.
 
     ``reward`` is what each step's mover earned by it, ``longest`` how many steps a game can have. ``N`` must be a multiple of ``T`` and at
-    least ``T + longest``; the outcomes in ``new`` are not looked at.
+    least ``T + longest``; the outcomes in ``new``, and where its endings lie, are not looked at.
     """
     steps, length = buffer.rows.player.shape[0], new.player.shape[0]
     rows = jax.tree.map(
@@ -77,6 +92,10 @@ def add_self_play(buffer: SelfPlayBuffer, new: Rows, reward: Float[Array, "T B"]
     rows = rows._replace(
         outcome=rows.outcome.at[window].set(jnp.where(told, said.outcome, outcome)), known=rows.known.at[window].set(known | told)
     )
+    if rows.ending is not None:
+        ended = window[jax.lax.cummin(jnp.where(ends, jnp.arange(reach)[:, None], reach - 1), reverse=True)]
+        where = jnp.where(told, ended, rows.ending.step[window])
+        rows = rows._replace(ending=rows.ending._replace(step=rows.ending.step.at[window].set(where)))
     return SelfPlayBuffer(rows, (buffer.position + length) % steps, jnp.minimum(buffer.size + length, steps))
 
 
@@ -102,10 +121,17 @@ def outcomes(player: Int8[Array, "T B"], reward: Float[Array, "T B"], done: Bool
 
 
 def sample_self_play(buffer: SelfPlayBuffer, key: Key[Array, ""], count: int) -> Rows:
-    """Draw ``count`` rows uniformly with replacement. Consumes the key; the cost does not grow with the ring's size."""
+    """Draw ``count`` rows uniformly with replacement, each with the ending of its game. Consumes the key.
+
+    The cost does not grow with the ring's size.
+    """
     steps, games = buffer.rows.player.shape
     # A remainder of 32 random bits is biased by less than size / 2**32.
     drawn = (jax.random.bits(key, (count,), jnp.uint32) % (buffer.size * games).astype(jnp.uint32)).astype(jnp.int32)
     oldest = (buffer.position - buffer.size) % steps
     step, game = (oldest + drawn // games) % steps, drawn % games
-    return jax.tree.map(lambda x: x[step, game], buffer.rows)
+    rows, kept = jax.tree.map(lambda x: x[step, game], buffer.rows), buffer.rows.ending
+    if kept is None:
+        return rows
+    end = rows.ending.step
+    return rows._replace(ending=Ending(kept.owner[end, game], kept.counts[end, game] & rows.known, end))

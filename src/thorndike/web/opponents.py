@@ -7,7 +7,7 @@ from typing import NamedTuple, TypeAlias
 from thorndike.errors import UserError
 from thorndike.games.engines import ENGINES, program_of
 from thorndike.games.game import Game, Player
-from thorndike.games.registry import FOR_ONE, WITH_DICE
+from thorndike.games.registry import FOR_ONE, can_be_searched
 from thorndike.games.registry import game as find_game
 from thorndike.games.trained import trained_run
 from thorndike.training.run_listing import all_runs, read_facts
@@ -52,7 +52,7 @@ def opponents_in(output: Path) -> Opponents:
     def opponents(game_id: str) -> Sequence[Opponent]:
         if is_for_one(game_id):
             return ()
-        searched = not (find_game(game_id).has_chance if ":" in game_id else game_id in WITH_DICE)
+        searched = can_be_searched(game_id)
         found = [
             _named(str(run), f"{run.parent.name}, {run.name}", searched, before="Trained: ")
             for run in reversed(all_runs(output))
