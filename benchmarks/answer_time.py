@@ -23,7 +23,7 @@ from thorndike.games.game import Turn
 from thorndike.games.match import compiled
 
 RESULT = Path(__file__).parents[1] / "benchmarks" / "results" / "answer_time.json"
-GAMES, SIMULATIONS = 3, 64
+GAMES, SIMULATIONS = 2, 64
 
 
 def at_the_terminal(seed: int) -> float:

@@ -94,7 +94,8 @@ def of_run(run: Path, games: int) -> dict[str, object]:
     units = np.array(means) if len(means) > 1 else points
     half = float(stdtrit(len(units) - 1, 0.975) * np.std(units, ddof=1) / len(units) ** 0.5)
     record = json.loads((run / "run.json").read_text(encoding="utf-8"))
-    told = {name: record.get(name) for name in ("steps_done", "cpu_s", "compile_s", "seed", "preset", "git_commit", "command")}
+    told = {name: record.get(name) for name in ("steps_done", "cpu_s", "compile_s", "seed", "config")}
+    told |= {"trained": record.get("command"), "trained_at_commit": record.get("git_commit")}
     mean = float(np.mean(means))
     return {**told, "mean_score": round(mean, 1), "ci95": [round(mean - half, 1), round(mean + half, 1)], "seeds": rows}
 
