@@ -136,7 +136,7 @@ def pairs(kept: int, plain: int, engines: int) -> list[tuple[int, int]]:
     others = [(own, kept + other) for other in range(plain) for own in range(kept)]
     between = [(kept + first, kept + second) for second in range(plain) for first in range(second)]
     strong = [(own, kept + plain + engine) for engine in range(engines) for own in range(max(kept - 2, 0), kept)]
-    return neighbours + widest + others + between + strong
+    return others + neighbours + widest + between + strong
 
 
 def matches(rules: Game, plan: Plan, pool: list[Side], games: int, seed: int, folder: Path) -> list[dict]:
