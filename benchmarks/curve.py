@@ -4,8 +4,8 @@ python benchmarks/curve.py go_9x9 --budget 600    into benchmarks/results/curve.
 
 The settings are the preset's. CPU-seconds are those of playing and learning on one core, compiling left out. Checkpoints and finished
 matches are kept in a folder (--keep): with the same folder the command goes on where it was, and does not train again what was trained.
-A checkpoint plays the next one and all others, the last one the first; openings are random, and played twice with colours swapped. Ratings
-are fitted to all games at once, and the random player's is set to 0.
+A checkpoint plays the next one and the plain players, the last one the first too, the last two the engines; openings are random, and played
+twice with colours swapped. Ratings are fitted to all games at once, and the random player's is set to 0.
 """
 
 import argparse
@@ -46,7 +46,7 @@ class Plan(NamedTuple):
     """Whom a game's checkpoints meet, and how games begin."""
 
     opponents: tuple[str, ...]
-    """Random moves first."""
+    """Random moves first, engines last."""
     simulations: int
     """Of a checkpoint's move."""
     opening_plies: int = 4
@@ -120,23 +120,31 @@ def sides(rules: Game, plan: Plan, algorithm: Algorithm, kept: list[Checkpoint],
 
     found = [own(each.actor)._replace(name=f"{each.cpu_s:.0f} CPU-s") for each in kept]
     for text in plan.opponents:
-        is_plain = text == "random" or text.startswith("mcts:")
-        found.append(mcts_side(rules, int(text.partition(":")[2] or 0), size) if is_plain else engine_side(text, rules))
+        found.append(mcts_side(rules, int(text.partition(":")[2] or 0), size) if is_plain(text) else engine_side(text, rules))
     return found
 
 
-def pairs(players: int, others: int) -> list[tuple[int, int]]:
-    """Who plays whom: the last ``others`` everybody, the checkpoints before them their neighbours, and the last the first."""
-    own = players - others
-    met = [(first, second) for first in range(players) for second in range(max(first + 1, own), players)]
-    return [*((first, first + 1) for first in range(own - 1)), *([(0, own - 1)] if own > 2 else []), *met]
+def is_plain(opponent: str) -> bool:
+    """Whether no program of somebody else's has to be started for it."""
+    return opponent == "random" or opponent.startswith("mcts:")
+
+
+def pairs(kept: int, plain: int, engines: int) -> list[tuple[int, int]]:
+    """Who plays whom, by place in the pool: checkpoints, then plain players, then engines, which take long for a move."""
+    neighbours = [(first, first + 1) for first in range(kept - 1)]
+    widest = [(0, kept - 1)] if kept > 2 else []
+    others = [(own, kept + other) for other in range(plain) for own in range(kept)]
+    between = [(kept + first, kept + second) for second in range(plain) for first in range(second)]
+    strong = [(own, kept + plain + engine) for engine in range(engines) for own in range(max(kept - 2, 0), kept)]
+    return others + neighbours + widest + between + strong
 
 
 def matches(rules: Game, plan: Plan, pool: list[Side], games: int, seed: int, folder: Path) -> list[dict]:
     """A row a pair: games won, drawn and lost by the first of it, of those that it began, and of those that the second began."""
     told = folder / "matches.jsonl"
     rows = [json.loads(line) for line in told.read_text(encoding="utf-8").splitlines()] if told.exists() else []
-    for first, second in pairs(len(pool), len(plan.opponents)):
+    plain = sum(map(is_plain, plan.opponents))
+    for first, second in pairs(len(pool) - len(plan.opponents), plain, len(plan.opponents) - plain):
         pair = {"players": [pool[first].name, pool[second].name], "games": games, "seed": seed}
         if any(pair.items() <= row.items() for row in rows):
             continue
