@@ -30,6 +30,7 @@ FLAGS = {
         "--num-envs",
         "--max-episode-steps",
         "--checkpoint-every",
+        "--keep-checkpoints",
         "--n-envs",
         "--total-timesteps",
         "-n",

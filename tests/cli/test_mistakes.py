@@ -10,6 +10,7 @@ import pytest
 from thorndike.cli.main import main
 
 MISTAKES = [
+    (["train", "ppo", "CartPole-v1", "--keep-checkpoints", "1"], "the 2 newest checkpoints always stay"),
     (["trian", "ppo"], "there is no verb 'trian'; did you mean 'train'?"),
     (["--steps"], "unknown flag --steps; the verb comes first"),
     (["train"], "which algorithm? One of ppo, a2c, reinforce, "),

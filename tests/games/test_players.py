@@ -9,10 +9,12 @@ import pytest
 
 from games.rules import KEY, Compiled
 from games.test_search import evaluate_made_up
+from thorndike.api.building import build_algorithm
 from thorndike.environments.wrappers import chain
 from thorndike.errors import UserError
 from thorndike.games import cut_search
 from thorndike.games.agent_player import agent_player
+from thorndike.games.environment import game_environment, observed_position
 from thorndike.games.game import Stopped, Turn, named_action
 from thorndike.games.players import mcts_player, random_player
 from thorndike.games.plies import positions_before
@@ -206,3 +208,18 @@ def test_a_memory_that_moves_do_not_depend_on_is_none(board):
     counts = stub(prefers_c3)._replace(memory=lambda size: jnp.zeros((size, 1)))
     choice = agent_player("stub", board.game, counts, chain(), ACTOR, (), {}, 8).choose(turn(board, "a1 a2 b1 b2"))
     assert sum(choice.visits.values()) == 8
+
+
+def test_a_network_with_memory_plays_what_it_would_have_played_in_training(board):
+    settings = {"memory": "gru", "memory_size": 4, "net_arch": (4,), "n_steps": 4, "batch_size": 4}
+    algorithm = build_algorithm("ppo", settings, game_environment(board.game, 2).spec, None)
+    actor = jax.tree.map(lambda leaf: 3 * leaf, algorithm.actor(jax.jit(algorithm.init)(KEY)))
+    player, names = agent_player("gru", board.game, algorithm, chain(), actor, (), {}, 64), "a1 b2 c3 a3 b1"
+    noise = jax.tree.map(lambda leaf: leaf[0, :1], algorithm.draw(KEY, 1))
+    greedy, memory = jax.jit(algorithm.greedy), algorithm.memory(1)
+    asked = turn(board, names)
+    for number, position in enumerate((*positions_before(asked), asked.position)):
+        obs = jax.tree.map(lambda leaf: leaf[None], observed_position(board.game, position))
+        memory, action, _ = greedy(actor, memory, obs, noise)
+        if number in (0, 3, 5):
+            assert player.choose(turn(board, " ".join(names.split()[:number]))).action == int(action[0])
