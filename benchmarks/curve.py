@@ -3,7 +3,8 @@
 python benchmarks/curve.py go_9x9 --budget 600    into benchmarks/results/curve.json and docs/images/curve_go_9x9.png
 
 The settings are the preset's. CPU-seconds are those of playing and learning on one core, compiling left out. Checkpoints and finished
-matches are kept in a folder (--keep): with the same folder the command goes on where it was, and does not train again what was trained.
+matches are kept in a folder (--keep): with the same folder the command goes on where it was, and does not train again what was trained. The
+result is written once everybody has played, and again after every further match.
 A checkpoint plays the next one and the plain players, the last one the first too, the last two the engines; openings are random, and played
 twice with colours swapped. Ratings are fitted to all games at once, and the random player's is set to 0.
 """
@@ -12,6 +13,7 @@ import argparse
 import json
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -136,26 +138,26 @@ def pairs(kept: int, plain: int, engines: int) -> list[tuple[int, int]]:
     others = [(own, kept + other) for other in range(plain) for own in range(kept)]
     between = [(kept + first, kept + second) for second in range(plain) for first in range(second)]
     strong = [(own, kept + plain + engine) for engine in range(engines) for own in range(max(kept - 2, 0), kept)]
-    return others + neighbours + widest + between + strong
+    return others + strong + between + widest + neighbours
 
 
-def matches(rules: Game, plan: Plan, pool: list[Side], games: int, seed: int, folder: Path) -> list[dict]:
-    """A row a pair: games won, drawn and lost by the first of it, of those that it began, and of those that the second began."""
+def matches(rules: Game, plan: Plan, pool: list[Side], games: int, seed: int, folder: Path) -> Iterator[list[dict]]:
+    """All rows so far, after each pair. A row: games won, drawn and lost by the first of it, of those that it began, and of the others."""
     told = folder / "matches.jsonl"
     rows = [json.loads(line) for line in told.read_text(encoding="utf-8").splitlines()] if told.exists() else []
+    asked = {"games": games, "seed": seed}
+    rows = [row for row in rows if asked.items() <= row.items() and set(row["players"]) <= {side.name for side in pool}]
     plain = sum(map(is_plain, plan.opponents))
     for first, second in pairs(len(pool) - len(plan.opponents), plain, len(plan.opponents) - plain):
-        pair = {"players": [pool[first].name, pool[second].name], "games": games, "seed": seed}
-        if any(pair.items() <= row.items() for row in rows):
-            continue
-        scores = play(rules, pool[first], pool[second], games, plan.opening_plies, seed).scores
-        began = [[part.count(value) for value in (1.0, 0.5, 0.0)] for part in (scores[0::2], scores[1::2])]
-        rows.append({**pair, "first_begins": began[0], "second_begins": began[1]})
-        with told.open("a", encoding="utf-8") as lines:
-            lines.write(json.dumps(rows[-1]) + "\n")
-        print(rows[-1], flush=True)
-    names = [side.name for side in pool]
-    return [row for row in rows if row["games"] == games and row["seed"] == seed and set(row["players"]) <= set(names)]
+        names = [pool[first].name, pool[second].name]
+        if all(row["players"] != names for row in rows):
+            scores = play(rules, pool[first], pool[second], games, plan.opening_plies, seed).scores
+            began = [[part.count(value) for value in (1.0, 0.5, 0.0)] for part in (scores[0::2], scores[1::2])]
+            rows.append({"players": names, **asked, "first_begins": began[0], "second_begins": began[1]})
+            with told.open("a", encoding="utf-8") as lines:
+                lines.write(json.dumps(rows[-1]) + "\n")
+            print(rows[-1], flush=True)
+        yield rows
 
 
 def rated(pool: list[str], kept: list[Checkpoint], rows: list[dict]) -> dict[str, object]:
@@ -215,20 +217,27 @@ def main() -> None:
         train(algorithm, environment, options.budget, options.seed, folder)
     kept = checkpoints(algorithm, folder)
     pool = sides(rules, plan, algorithm, kept, options.games // 2)
-    try:
-        rows = matches(rules, plan, pool, options.games, options.seed, folder)
-    finally:
-        for side in pool:
-            side.close()
     trained = json.loads((folder / "training.json").read_text(encoding="utf-8"))
     told = {key: value for key, value in trained.items() if key != "checkpoints"}
     command = f"python benchmarks/curve.py {name} --budget {trained['budget_cpu_s']:g} --games {options.games} --seed {options.seed}"
     told |= {"command": command, "games_a_pair": options.games, "opening_plies": plan.opening_plies, "simulations": plan.simulations}
     told |= {"num_envs": preset.num_envs, "settings": {**preset.settings, **preset.env_kwargs, "total_steps": preset.steps}}
+    names = [side.name for side in pool]
+    try:
+        for rows in matches(rules, plan, pool, options.games, options.seed, folder):
+            if {player for row in rows for player in row["players"]} == set(names):
+                keep(name, told | rated(names, kept, rows))
+    finally:
+        for side in pool:
+            side.close()
+
+
+def keep(name: str, row: dict[str, object]) -> None:
+    """Into the results, and drawn."""
     results = json.loads(RESULT.read_text(encoding="utf-8")) if RESULT.exists() else {}
-    results[name] = told | rated([side.name for side in pool], kept, rows)
+    results[name] = row
     RESULT.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
-    draw(name, results[name])
+    draw(name, row)
 
 
 if __name__ == "__main__":
