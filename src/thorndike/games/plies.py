@@ -80,22 +80,26 @@ def positions_before(turn: Turn) -> tuple[Position, ...]:
     return tuple(found[:-1])
 
 
+_GAMES = 64
+"""Games whose moves are remembered: matches may be played side by side."""
+
+
 class MoveNames:
-    """Who played what, by name, of one game after another: what is known of the moves so far is kept for the next question."""
+    """Who played what, by name: what is known of a game's moves so far is kept for the next question, of the games asked about last."""
 
     def __init__(self) -> None:
         """Nothing is known yet."""
-        self._moves: list[int] = []
-        self._names: list[tuple[int, str]] = []
-        self._position: Position = None
+        self._known: dict[tuple[int, ...], tuple[list[tuple[int, str]], Position]] = {}
 
     def __call__(self, turn: Turn) -> list[tuple[int, str]]:
         """Player and name of each move of a game without dice."""
         game, key = turn.game, jax.random.key(0)
-        if self._position is None or list(turn.moves[: len(self._moves)]) != self._moves:
-            self._moves, self._names, self._position = [], [], game.init(key)
-        for action in turn.moves[len(self._moves) :]:
-            self._names.append((int(jax.jit(game.player)(self._position)), game.action_name(self._position, action)))
-            self._moves.append(action)
-            self._position = jax.jit(game.step)(self._position, jnp.int32(action), key)
-        return list(self._names)
+        begun = next((moves for k in range(len(turn.moves), -1, -1) if (moves := turn.moves[:k]) in self._known), ())
+        names, position = self._known.pop(begun) if begun else ([], game.init(key))
+        for action in turn.moves[len(begun) :]:
+            names.append((int(jax.jit(game.player)(position)), game.action_name(position, action)))
+            position = jax.jit(game.step)(position, jnp.int32(action), key)
+        self._known[turn.moves] = names, position
+        if len(self._known) > _GAMES:
+            del self._known[next(iter(self._known))]
+        return list(names)
