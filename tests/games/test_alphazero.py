@@ -12,13 +12,14 @@ import thorndike as td
 import tic_tac_toe_lines as lines
 from thorndike.algorithms.alphazero import Config, alphazero, alphazero_loss
 from thorndike.api.building import build_algorithm
-from thorndike.environments.wrappers import normalize_observation
+from thorndike.environments.wrappers import chain, normalize_observation
 from thorndike.errors import UserError
 from thorndike.games.environment import game_environment, observed_position
 from thorndike.games.self_play import Batch
 from thorndike.games.tic_tac_toe import TIC_TAC_TOE
 from thorndike.networks.board import TOWERS, board_network, win_value
 from thorndike.networks.network import Network
+from thorndike.training.sources import compiled_source
 
 
 def test_the_loss_is_that_of_a_slow_loop():
@@ -69,6 +70,23 @@ def test_what_is_no_game_of_two_is_refused():
     for name in ("alphazero", "muzero"):
         with pytest.raises(UserError, match=r"tic_tac_toe is learnt from its board as the rules show it, which a wrapper changes"):
             build_algorithm(name, {}, normalize_observation().spec(spec), None)
+
+
+def test_the_newest_average_is_what_asks_to_pass_the_gate_and_the_best_is_what_plays(monkeypatch: pytest.MonkeyPatch):
+    small = {"n_steps": 2, "batch_size": 16, "gradient_steps": 1, "num_simulations": 2, "width": 8, "blocks": 0}
+    environment = game_environment(TIC_TAC_TOE, 4)
+    plain, gated = alphazero(Config(**small), environment.spec), alphazero(Config(**small, gate_every=1), environment.spec)
+    source, seen = compiled_source(environment, gated, chain()), []
+    monkeypatch.setattr("thorndike.algorithms.alphazero.try_gate", lambda game, decide, how, gate, candidate, *rest: (candidate, {}))
+
+    def once(key):
+        state, ungated, noise = gated.init(key), plain.init(key), jax.tree.map(lambda leaf: leaf[0], source.draw(key, 1))
+        assert gated.actor(state) is state.gate.best and plain.actor(ungated) is ungated.average
+        later, _ = gated.update(state, source.collect(source.init(key), gated.actor(state), noise)[1], key)
+        seen.extend(one is other for one, other in zip(jax.tree.leaves(later.gate), jax.tree.leaves(later.average), strict=True))
+
+    jax.eval_shape(once, jax.random.key(0))
+    assert seen and all(seen)
 
 
 def test_a_run_is_saved_loaded_and_gone_on_with(tmp_path: Path, quick_compile: None):

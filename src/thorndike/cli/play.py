@@ -5,10 +5,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from thorndike.cli.answer import Answer
-from thorndike.cli.choose_player import GAME_HELP, PLAYER_HELP, can_be_searched, check_game, choose_player
+from thorndike.cli.choose_player import GAME_HELP, PLAYER_HELP, check_game, choose_player
 from thorndike.cli.find_run import add_output_argument
 from thorndike.cli.parser import Parser, seed_number
 from thorndike.errors import UserError
+from thorndike.games.registry import can_be_searched
 from thorndike.games.trained import trained_run
 
 if TYPE_CHECKING:
