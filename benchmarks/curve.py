@@ -57,7 +57,6 @@ class Plan(NamedTuple):
 PLANS = {
     "go_9x9": Plan(("random", "mcts:8", "gnugo:level=1"), 32),
     "chess": Plan(("random", "fairy:skill=-20,depth=1", "stockfish:skill=0,depth=1"), 16),
-    "gardner_chess": Plan(("random", "fairy:skill=-20,depth=1"), 32),
 }
 
 

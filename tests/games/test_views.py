@@ -1,12 +1,14 @@
 """What a player of Go and of chess sees, square by square."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from games.rules import KEY, Compiled, SlowGo
 from thorndike.games.game import Game, Position
 from thorndike.games.registry import game
+from thorndike.networks.board import board_network
 
 
 def beginnings(made: Game, seed: int, most: int) -> list[tuple[Position, int | None, Compiled]]:
@@ -69,3 +71,15 @@ def test_chess_shows_pieces_where_the_moves_of_their_squares_are_numbered(id, qu
         movers = set(np.flatnonzero(seen[..., :6].sum(axis=-1).reshape(-1)).tolist())
         assert {action // (made.num_actions // size**2) for action in compiled.facts(position)[0].tolist()} <= movers
         assert seen[..., 12].min() == 1
+
+
+def test_squares_say_what_their_moves_are_worth_by_the_same_weights():
+    network = board_network(2 * 20 + 1, "squares", 8, 0)
+    board = jax.random.normal(KEY, (1, 4, 5, 3))
+    params = network.init(KEY, board)
+    logits, _ = network.apply(params, board)
+    moved, _ = network.apply(params, jnp.roll(board, 1, axis=2))
+    by_square, by_moved = (x[0, :-1].reshape(4, 5, 2) for x in (logits, moved))
+    # Away from the edge a shifted board has the shifted moves.
+    np.testing.assert_allclose(by_moved[:, 2:-1], by_square[:, 1:-2], rtol=1e-5, atol=1e-7)
+    assert float(jnp.abs(by_square).max()) > 0
