@@ -320,7 +320,9 @@ def test_what_acts_is_read_without_the_replay(tmp_path, monkeypatch, compiled):
     """Two seeds; a wrapper that is not asked for stands before the one whose statistics are."""
 
     def learner(count):
-        return {"params": jnp.full((3, 2), count, jnp.float32), "ring": jnp.zeros(LONG) + count, "count": jnp.int32(count)}
+        # None, as the gate of an AlphaZero that has none.
+        arrays = {"params": jnp.full((3, 2), count, jnp.float32), "ring": jnp.zeros(LONG) + count, "count": jnp.int32(count)}
+        return {**arrays, "gate": None}
 
     def both(tree):
         return jax.tree.map(lambda leaf: jnp.stack([leaf, leaf + 1]), tree)

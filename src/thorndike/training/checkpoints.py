@@ -151,7 +151,8 @@ def read_actors(
     learner, learnt = read_tree((part, {"statistics": held} if compiled else held), SealedFolder(folder), STATE, part=True)
 
     def actor(part: PyTree) -> PyTree:
-        leaves = zip(shapes, jax.tree.leaves(part, is_leaf=lambda leaf: leaf is None), strict=True)
+        # Not the leaves of ``part``: what is None in every state of a learner would count among them.
+        leaves = zip(shapes, structure.flatten_up_to(part), strict=True)
         return algorithm.actor(jax.tree.unflatten(structure, [shape if leaf is None else leaf for shape, leaf in leaves]))
 
     found = learnt["statistics"] if compiled else learnt

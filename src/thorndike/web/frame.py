@@ -44,12 +44,18 @@ class Notice:
         self._line = Tag("p", "notice", "", {"role": "alert"})
 
     async def doing(self, work: Callable[[], _Result]) -> _Result | None:
-        """Do something in a thread, so that the page never waits; a user's mistake is told here. None where it failed."""
+        """Do something in a thread, so that the page never waits; a user's mistake is told here. None where it failed.
+
+        Of any other error the page says that there was one; it goes on, to the log.
+        """
         try:
             result = await run.io_bound(work)
         except UserError as error:
             self._line.set_text(str(error))
             return None
+        except Exception as error:
+            self._line.set_text(f"this is a fault of Thorndike's or of the game's ({type(error).__name__}): the terminal says more")
+            raise
         self._line.set_text("")
         return result
 

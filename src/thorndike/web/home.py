@@ -88,9 +88,11 @@ def add_home(studio: Studio, doors: Sequence[Door] = ()) -> None:
                     # Games of pgx take some seconds to compile.
                     start_button.set_text("Setting up the board…")
                     start_button.set_attribute("disabled", True)
-                    name = await notice.doing(lambda: studio.open(form.setup))
-                    start_button.set_text("Start")
-                    start_button.set_attribute("disabled", None)
+                    try:
+                        name = await notice.doing(lambda: studio.open(form.setup))
+                    finally:
+                        start_button.set_text("Start")
+                        start_button.set_attribute("disabled", None)
                     if name is not None:
                         ui.navigate.to(f"/play/{name}")
 

@@ -2,7 +2,7 @@
 
 from thorndike.web.controls import Tag, select
 from thorndike.web.looks import look_of
-from thorndike.web.opponents import STRENGTHS, is_for_one
+from thorndike.web.opponents import STRENGTHS, Opponent, is_for_one
 from thorndike.web.studio import Setup, Studio
 
 
@@ -12,6 +12,9 @@ class SetupForm:
     def __init__(self, studio: Studio, setup: Setup) -> None:
         self.setup = self._seen = setup
         self._offered = {opponent.id: opponent for opponent in studio.opponents(setup.game)}
+        if setup.opponent not in self._offered:
+            # A run may be gone, or its checkpoint have made room for a newer one, since this game began.
+            self._offered[setup.opponent] = Opponent(setup.opponent, f"{setup.opponent} (no longer there)", None)
         sides = look_of(setup.game).sides
         with Tag("div", "fields") as fields:
             fields.set_attribute("hidden", True if is_for_one(setup.game) else None)
@@ -45,9 +48,10 @@ class SetupForm:
         self._update()
 
     def _update(self) -> None:
-        chosen = self._offered[self.setup.opponent]
-        self._opponent.set_attribute("value", chosen.id)
+        # None where another page chose somebody who was not there yet when this one was made.
+        chosen = self._offered.get(self.setup.opponent)
+        self._opponent.set_attribute("value", self.setup.opponent)
         self._strength.set_attribute("value", str(self.setup.simulations))
         self._begins.set_attribute("value", "person" if self.setup.person_begins else "opponent")
-        self._strength.set_attribute("disabled", None if chosen.searches else True)
-        self._begins.set_attribute("disabled", None if chosen.make is not None else True)
+        self._strength.set_attribute("disabled", None if chosen is None or chosen.searches else True)
+        self._begins.set_attribute("disabled", None if chosen is None or chosen.make is not None else True)
