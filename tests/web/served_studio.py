@@ -62,11 +62,24 @@ def broken(game: Game, simulations: int) -> Player:
     return Player("Broken", choose)
 
 
+def faulty(game: Game, simulations: int) -> Player:
+    raise ValueError("a fault that nobody foresaw")
+
+
+def leaving(game: Game, simulations: int) -> Player:
+    """Not offered any more once it has sat down, as a checkpoint that made room for a newer one."""
+    gone.append("leaving")
+    return first(game, simulations)
+
+
+gone: list[str] = []
 OPPONENTS = (
     Opponent("lookahead", "Lookahead", lookahead, searches=True),
     Opponent("first", "First legal move", first),
     Opponent("slow", "Slow", slow, searches=True),
     Opponent("broken", "Broken", broken),
+    Opponent("faulty", "Faulty", faulty),
+    Opponent("leaving", "Leaving", leaving),
 )
 
 
@@ -78,7 +91,7 @@ def doors(where: str) -> tuple[Door, ...]:
 if __name__ == "__main__":
     serve(
         ("tic_tac_toe", "connect_four"),
-        lambda game_id: OPPONENTS,
+        lambda game_id: [each for each in OPPONENTS if each.id not in gone],
         host=sys.argv[2] if len(sys.argv) > 2 else "127.0.0.1",
         port=0,
         told=lambda address: print(address, flush=True),

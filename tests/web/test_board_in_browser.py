@@ -261,6 +261,26 @@ def test_an_opponent_that_breaks_is_told_and_another_sits_down(page, studio):
     expect(moves(page)).to_have_text(["a3", "b3"])
 
 
+def test_a_game_outlives_its_opponents_place_in_the_list(page, studio):
+    start(page, studio, opponent="leaving")
+    page.reload()
+    expect(status(page)).to_have_text("Your turn: you are X")
+    page.get_by_text("Change the opponent").click()
+    expect(page.get_by_label("Opponent")).to_have_value("leaving")
+    square(page, 1, 1).click()
+    expect(moves(page)).to_have_count(2)
+
+
+def test_a_fault_is_told_and_another_can_be_chosen(page, studio):
+    page.goto(f"{studio.root}/new/tic_tac_toe")
+    page.get_by_label("Opponent").select_option("faulty")
+    page.get_by_role("button", name="Start").click()
+    expect(page.get_by_role("alert")).to_contain_text("a fault of Thorndike's or of the game's (ValueError)")
+    page.get_by_label("Opponent").select_option("first")
+    page.get_by_role("button", name="Start").click()
+    page.wait_for_url("**/play/*")
+
+
 def test_what_is_being_chosen_survives_a_move_and_follows_swapped_sides(page, studio):
     start(page, studio, opponent="first")
     page.get_by_text("Change the opponent").click()
