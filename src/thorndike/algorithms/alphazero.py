@@ -16,7 +16,7 @@ Deviations from Silver et al.:
 8. Where squares decide the game, two more heads may learn how it ends (``ownership_coef``, ``score_coef``: KataGo, section 4.1): squares by
    cross-entropy, and their number by Huber's loss in place of a distribution of scores. No search asks them.
 
-Rewards are the mover's: ``rollout/ep_rew_mean`` is the share of games that were won by either. Logs ``train/loss``, ``policy_loss``,
+Rewards are the mover's: ``rollout/ep_rew_mean`` is what games paid to whoever moved last. Logs ``train/loss``, ``policy_loss``,
 ``value_loss``, ``ownership_loss``, ``score_loss`` (of these heads), ``policy_kl`` (the loss less the target's entropy), ``known_outcomes``,
 ``grad_norm``, ``learning_rate`` and, of positions in games played on, ``resign_checks``: the share in which the mover would have resigned,
 ``resign_errors``: and yet did not lose. Results: docs/algorithms/alphazero.md.

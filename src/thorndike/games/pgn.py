@@ -2,6 +2,7 @@
 
 import importlib
 import io
+import logging
 from types import ModuleType
 
 from thorndike.errors import UserError
@@ -32,10 +33,10 @@ def read_pgn(text: str, where: str) -> GameRecord:
     game = chess.read_game(io.StringIO(text))
     if game is None:
         raise UserError(f"{where} is no PGN record: it holds no game")
-    if game.errors:
-        raise UserError(f"{where} is no sound PGN record: {' '.join(str(game.errors[0]).split())[:200]}")
     if "FEN" in game.headers or game.headers.get("Variant", "Standard") not in ("Standard", "Chess"):
         raise UserError(f"{where}: only chess from its usual beginning is read")
+    if game.errors:
+        raise UserError(f"{where} is no sound PGN record: {' '.join(str(game.errors[0]).split())[:200]}")
     if not game.variations and "White" not in text:
         raise UserError(f"{where} is no PGN record: it holds no game")
     moves = tuple((ply % 2, move.uci()) for ply, move in enumerate(game.mainline_moves()))
@@ -45,6 +46,8 @@ def read_pgn(text: str, where: str) -> GameRecord:
 
 def _chess() -> ModuleType:
     try:
+        # Errors are told by whoever reads; python-chess would log them, too.
+        logging.getLogger("chess.pgn").disabled = True
         return importlib.import_module("chess.pgn")
     except ModuleNotFoundError:
         raise UserError("PGN needs python-chess: pip install 'thorndike[games]'") from None

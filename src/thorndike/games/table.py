@@ -327,7 +327,8 @@ class Table:
             try:
                 choice = seat.player.choose(turn)
             except Stopped:
-                return
+                # Nothing, unless a player of the user's raised it unasked.
+                return self._give_up(task, f"{seat.name} stopped, though its move was waited for")
             except Exception as error:
                 self._give_up(task, f"{seat.name} cannot go on: {error}")
                 if not isinstance(error, UserError):

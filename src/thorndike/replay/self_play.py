@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int, Int8, Int32, Key
 
 
 class Ending(NamedTuple):
-    """How the board looked when games had ended, with any leading axes. It lies in the ring once a game, with the row that ended it."""
+    """How the board looked when games had ended, with any leading axes. Each row has room for one, filled where a game ended."""
 
     owner: Int8[Array, "*rows H W"]
     """Whose each square was: 1 player 0's, -1 player 1's, 0 nobody's."""

@@ -105,7 +105,7 @@ def checkpoint_of(run: Path, step: str | int) -> Path:
     known = {path.name: path for path in checkpoints(run)}
     if str(step) not in known:
         there = f"it has those of {', '.join(known)}" if known else "it has none"
-        raise UserError(f"{run} has no checkpoint of step {step}: {there}")
+        raise UserError(f"{run} has no checkpoint of step {step}: {there if run.is_dir() else 'there is no such folder'}")
     return known[str(step)]
 
 
