@@ -151,9 +151,8 @@ def read_actors(
     learner, learnt = read_tree((part, {"statistics": held} if compiled else held), SealedFolder(folder), STATE, part=True)
 
     def actor(part: PyTree) -> PyTree:
-        # Not the leaves of ``part``: what is None in every state of a learner would count among them.
-        leaves = zip(shapes, structure.flatten_up_to(part), strict=True)
-        return algorithm.actor(jax.tree.unflatten(structure, [shape if leaf is None else leaf for shape, leaf in leaves]))
+        whole = jax.tree.unflatten(structure, shapes)
+        return algorithm.actor(jax.tree.map(lambda shape, leaf: shape if leaf is None else leaf, whole, part))
 
     found = learnt["statistics"] if compiled else learnt
     return jax.vmap(actor)(learner), tuple(found[str(place)] for place in statistics)
