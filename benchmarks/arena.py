@@ -11,6 +11,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from machine import commit, keep_row
+
 ROOT = Path(__file__).parents[1]
 RESULT = ROOT / "benchmarks" / "results" / "arena.json"
 COMMANDS = (
@@ -33,19 +35,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("game", nargs="?", help="the matches of this game only")
     chosen = parser.parse_args().game
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True, cwd=ROOT).stdout.strip()
     for words in COMMANDS:
         if chosen not in (None, words.split()[0]):
             continue
         began = cpu_seconds()
         command = [sys.executable, "-m", "thorndike", "arena", *words.split(), "--json"]
         answer = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
-        results = json.loads(RESULT.read_text(encoding="utf-8")) if RESULT.exists() else {}
         # With the engines' seconds, and compiling.
-        results[f"thorndike arena {words}"] = {"commit": commit, "seed": 0, "cpu_s": round(cpu_seconds() - began, 1), **answer}
-        RESULT.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
-        for row in answer["matches"]:
-            print(words.split()[0], row["players"], row["wins"], row["draws"], row["losses"], flush=True)
+        row = {"commit": commit(ROOT), "seed": 0, "cpu_s": round(cpu_seconds() - began, 1), **answer}
+        keep_row(RESULT, f"thorndike arena {words}", row)
+        for each in answer["matches"]:
+            print(words.split()[0], each["players"], each["wins"], each["draws"], each["losses"], flush=True)
 
 
 if __name__ == "__main__":

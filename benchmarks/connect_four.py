@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import thorndike as td
-from machine import origin
+from machine import keep_row, origin
 from thorndike.api.building import build_algorithm
 from thorndike.games.connect_four import CONNECT_FOUR
 from thorndike.games.environment import observed_position
@@ -247,14 +247,13 @@ def main() -> None:
     options = parser.parse_args()
     if options.positions:
         make_positions(options.opponents)
-    results = json.loads(RESULT.read_text(encoding="utf-8")) if RESULT.exists() else {}
     if options.depth is not None:
-        results[f"minimax, depth {options.depth}"] = {**origin(), "errors": errors(minimax(options.depth))}
-        print(results[f"minimax, depth {options.depth}"])
+        found = {**origin(), "errors": errors(minimax(options.depth))}
+        keep_row(RESULT, f"minimax, depth {options.depth}", found)
+        print(found)
     if options.run is not None:
         row = measure(options.run, options.opponents, options.simulations, options.games, options.rollouts)
-        results[options.name or options.run.name] = {**origin(), **row}
-    RESULT.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
+        keep_row(RESULT, options.name or options.run.name, {**origin(), **row})
 
 
 if __name__ == "__main__":

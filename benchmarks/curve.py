@@ -21,7 +21,7 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from machine import commit, versions
+from machine import commit, keep_row, versions
 from side_by_side import Side, engine_side, mcts_side, play, together
 from thorndike.algorithms.alphazero import Config, alphazero
 from thorndike.environments.wrappers import chain
@@ -75,11 +75,12 @@ def learner(rules: Game, preset: Preset, simulations: int) -> tuple[Algorithm, E
     return alphazero(config, environment.spec), environment
 
 
-def train(algorithm: Algorithm, environment: Environment, budget: float, seed: int, folder: Path) -> None:
+def train(algorithm: Algorithm, environment: Environment, preset: Preset, budget: float, seed: int, folder: Path) -> None:
     """Train for ``budget`` CPU-seconds; the checkpoints at ``CHECKPOINTS`` of it, into ``folder`` as they come."""
     bound = runner(algorithm, compiled_source(environment, algorithm, chain()), seed, range(1))
     carry, done, spent, due = bound.init(), 0, 0.0, [share * budget for share in CHECKPOINTS]
     facts: dict[str, object] = {"budget_cpu_s": budget, "seed": seed, "commit": commit(ROOT), "versions": versions(Path(sys.executable))}
+    facts |= {"num_envs": preset.num_envs, "settings": {**preset.settings, **preset.env_kwargs, "total_steps": preset.steps}}
     points: list[dict[str, float]] = []
     while due:
         if spent >= due[0]:
@@ -213,14 +214,13 @@ def main() -> None:
     rules, preset = game(name), find_preset("alphazero", name)
     algorithm, environment = learner(rules, preset, plan.simulations)
     if not (folder / "training.json").exists():
-        train(algorithm, environment, options.budget, options.seed, folder)
+        train(algorithm, environment, preset, options.budget, options.seed, folder)
     kept = checkpoints(algorithm, folder)
     pool = sides(rules, plan, algorithm, kept, options.games // 2)
     trained = json.loads((folder / "training.json").read_text(encoding="utf-8"))
     told = {key: value for key, value in trained.items() if key != "checkpoints"}
     command = f"python benchmarks/curve.py {name} --budget {trained['budget_cpu_s']:g} --games {options.games} --seed {options.seed}"
     told |= {"command": command, "games_a_pair": options.games, "opening_plies": plan.opening_plies, "simulations": plan.simulations}
-    told |= {"num_envs": preset.num_envs, "settings": {**preset.settings, **preset.env_kwargs, "total_steps": preset.steps}}
     names = [side.name for side in pool]
     try:
         for rows in matches(rules, plan, pool, options.games, options.seed, folder):
@@ -233,9 +233,7 @@ def main() -> None:
 
 def keep(name: str, row: dict[str, object]) -> None:
     """Into the results, and drawn."""
-    results = json.loads(RESULT.read_text(encoding="utf-8")) if RESULT.exists() else {}
-    results[name] = row
-    RESULT.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
+    keep_row(RESULT, name, row)
     draw(name, row)
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import thorndike as td
 from connect_four import Match
+from machine import origin
 from side_by_side import play, run_side
 from thorndike.games.othello import OTHELLO
 
@@ -66,7 +67,7 @@ def main() -> None:
     parser.add_argument("--games", type=int, default=100, help="of each seed's pair")
     parser.add_argument("--simulations", type=int, default=16)
     options = parser.parse_args()
-    rows: dict[str, object] = {"steps": options.steps, "settings": SETTINGS | ARMS["with"], "simulations": options.simulations}
+    rows: dict[str, object] = {**origin(), "steps": options.steps, "settings": SETTINGS | ARMS["with"], "simulations": options.simulations}
     scores: list[float] = []
     for seed in options.seeds:
         facts = {arm: trained(options.output / f"{arm}-{seed}", arm, options.steps, seed) for arm in ARMS}

@@ -6,6 +6,7 @@ import platform
 import shlex
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 
 PACKAGES = (
@@ -54,6 +55,12 @@ def origin() -> dict[str, str]:
         "command": shlex.join(["python", f"benchmarks/{Path(sys.argv[0]).name}", *sys.argv[1:]]),
         "commit": commit(Path(__file__).parents[1]),
     }
+
+
+def keep_row(results: Path, name: str, row: Mapping[str, object]) -> None:
+    """Put a row into a file of results; the others stay as they are."""
+    rows = json.loads(results.read_text(encoding="utf-8")) if results.exists() else {}
+    results.write_text(json.dumps({**rows, name: row}, indent=1) + "\n", encoding="utf-8")
 
 
 def versions(python: Path) -> dict[str, str]:

@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 
 from connect_four import Match
-from machine import origin
+from machine import keep_row, origin
 from side_by_side import engine_side, play, run_side
 from thorndike.games.othello import OTHELLO
 
@@ -44,9 +44,8 @@ def main() -> None:
     row |= match.described()
     # All our games are searched together; compiling is in our seconds.
     row |= {"cpu_s_ours": round(spent, 1), "cpu_s_rhino": round(used.ru_utime + used.ru_stime, 1)}
-    results = json.loads(RESULT.read_text(encoding="utf-8")) if RESULT.exists() else {}
-    results[f"{options.name or options.run.name}, {options.simulations} simulations, level {options.level}"] = {**row, **origin()}
-    RESULT.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
+    name = f"{options.name or options.run.name}, {options.simulations} simulations, level {options.level}"
+    keep_row(RESULT, name, {**row, **origin()})
     print(json.dumps(row))
 
 

@@ -19,7 +19,7 @@ from jaxtyping import PyTree
 from scipy.special import stdtrit
 
 import thorndike as td
-from machine import origin
+from machine import keep_row, origin
 from thorndike.games.environment import observed_position
 from thorndike.games.game import Position
 from thorndike.games.registry import game
@@ -112,9 +112,8 @@ def main() -> None:
         rows[options.name or options.run.name] = of_run(options.run, options.games)
     if options.only_look:
         return
-    results = json.loads(RESULT.read_text(encoding="utf-8")) if RESULT.exists() else {}
-    results |= {name: {**origin(), **row} for name, row in rows.items()}
-    RESULT.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
+    for name, row in rows.items():
+        keep_row(RESULT, name, {**origin(), **row})
 
 
 if __name__ == "__main__":

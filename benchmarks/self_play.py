@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import mctx
 import pgx
 
-from machine import origin
+from machine import keep_row, origin
 from thorndike.algorithms.alphazero import Config, alphazero
 from thorndike.games.connect_four import CONNECT_FOUR
 from thorndike.games.environment import game_environment
@@ -175,9 +175,8 @@ def main() -> None:
         "rounds_positions_per_cpu_s": rates,
     }
     row |= {"ratio": median(ratios), "ratios": ratios, "shares": {**shares, "tree": round(1 - sum(shares.values()), 3)}}
-    results = json.loads(RESULT.read_text(encoding="utf-8")) if RESULT.exists() else {}
-    results[f"{options.tower} {options.width} x {options.blocks}, {options.simulations} simulations, {options.games} games"] = row
-    RESULT.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
+    name = f"{options.tower} {options.width} x {options.blocks}, {options.simulations} simulations, {options.games} games"
+    keep_row(RESULT, name, row)
     print(json.dumps(row))
 
 

@@ -26,7 +26,7 @@ import optax
 import pgx
 
 from connect_four import labelled, positions_of
-from machine import origin
+from machine import keep_row, origin
 from thorndike.algorithms.alphazero import Config, alphazero
 from thorndike.environments.wrappers import chain
 from thorndike.games.connect_four import CONNECT_FOUR
@@ -234,7 +234,6 @@ def measure(name: str, budget: float, seed: int, first: float) -> None:
     learners = {"ours": ours, "plain": plain, "plain_patches": partial(plain, tower="patches", width=256, blocks=2)}
     learner = learners[name](seed)
     points, spent, due = [], 0.0, first
-    results = json.loads(RESULT.read_text(encoding="utf-8")) if RESULT.exists() else {}
     positions, choose = next(learner)
     # The first round compiles; its seconds are those of its positions at the rate of the rounds after it.
     points.append({"cpu_s": 0.0, "positions": positions, "errors": judge(choose)})
@@ -250,9 +249,7 @@ def measure(name: str, budget: float, seed: int, first: float) -> None:
             points[0]["cpu_s"] = round(spent / (rounds - 1), 1)
             points.append({"cpu_s": round(seconds, 1), "positions": positions, "errors": judge(choose)})
             print(name, points[-1], flush=True)
-            results = json.loads(RESULT.read_text(encoding="utf-8")) if RESULT.exists() else {}
-            results[name] = {**origin(), "seed": seed, "simulations": SIMULATIONS, "points": points}
-            RESULT.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
+            keep_row(RESULT, name, {**origin(), "seed": seed, "simulations": SIMULATIONS, "points": points})
 
 
 def seconds_to(points: Sequence[dict], error: float) -> float | None:

@@ -11,7 +11,7 @@ import tempfile
 from pathlib import Path
 
 import thorndike as td
-from machine import origin
+from machine import keep_row, origin
 
 ROOT = Path(__file__).parents[1]
 RESULT = ROOT / "benchmarks" / "results" / "tic_tac_toe.json"
@@ -42,9 +42,7 @@ def main() -> None:
         row |= {"cpu_s": round(trained.cpu_s, 1), "compile_s": round(trained.compile_s, 1)}
         for count in SIMULATIONS[options.algorithm]:
             row[f"{count} simulations"] = [walked(trained.run, count, seed) for seed in range(options.seeds)]
-    results = json.loads(RESULT.read_text(encoding="utf-8")) if RESULT.exists() else {}
-    results[f"{options.algorithm}, {options.seeds} of seed {options.seed}"] = row
-    RESULT.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
+    keep_row(RESULT, f"{options.algorithm}, {options.seeds} of seed {options.seed}", row)
     print(json.dumps(row))
 
 
