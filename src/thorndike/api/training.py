@@ -171,7 +171,7 @@ def runs(output: str | Path = "runs") -> list[Path]:
 def _check(algorithm: str, seed: int, seeds: int, num_envs: int | None, keep_checkpoints: int) -> None:
     check_algorithm(algorithm)
     if keep_checkpoints < KEPT:
-        raise UserError(f"the {KEPT} newest checkpoints always stay; got keep_checkpoints={keep_checkpoints}")
+        raise UserError(f"the {KEPT} newest checkpoints always stay, for one may be damaged; got keep_checkpoints={keep_checkpoints}")
     if max(seeds, num_envs or 1) > _MOST:
         raise UserError(f"at most {_MOST:,} seeds and environments each; got seeds={seeds}, num_envs={num_envs}")
     if not 0 <= seed < 2**32 or seeds < 1:

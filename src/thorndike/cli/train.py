@@ -5,7 +5,7 @@ import errno
 import math
 import os
 import shlex
-from argparse import SUPPRESS, ArgumentTypeError, Namespace
+from argparse import SUPPRESS, Namespace
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -264,7 +264,7 @@ def _parse(words: Sequence[str]) -> Namespace:
     parser.add_argument("--name", help="the last part of the run directory's name")
     parser.add_argument("--checkpoint-every", type=positive_whole, metavar="STEPS", help="steps between two checkpoints")
     keep_help = "how many of the newest stay, 2 or more, for a match between them (default: 2)"
-    parser.add_argument("--keep-checkpoints", type=checkpoint_number, default=2, metavar="N", help=keep_help)
+    parser.add_argument("--keep-checkpoints", type=positive_whole, default=2, metavar="N", help=keep_help)
     parser.add_argument(
         "--actor-threads", type=positive_whole, default=0, metavar="N", help="threads that step host environments while the learner learns"
     )
@@ -275,14 +275,6 @@ def _parse(words: Sequence[str]) -> Namespace:
         "--env-restarts", type=positive_whole, default=0, metavar="N", help="faults after which a thread's environments are made anew"
     )
     return parser.parse(words)
-
-
-def checkpoint_number(text: str) -> int:
-    """How many checkpoints are kept: 2 at least, for one may be damaged."""
-    number = positive_whole(text)
-    if number < 2:
-        raise ArgumentTypeError("the 2 newest checkpoints always stay, for one may be damaged: give 2 or more")
-    return number
 
 
 def check_reward(folder: Path | None) -> None:

@@ -59,6 +59,7 @@ def try_gate(
     """Where a match is due, the candidate plays it, and passes or not; and what is logged. Consumes the key."""
     if gate is None:
         return None, {}
+    # The match is told too: where seeds are vmapped both branches of a condition are computed.
     due = iteration % settings.every == 0
     score = jax.lax.cond(
         due, lambda: match_score(game, decide, candidate, gate.best, settings.games, due, key), lambda: jnp.zeros_like(gate.score)
